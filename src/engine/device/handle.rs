@@ -257,6 +257,14 @@ impl<T: Clone> PendingReply<T> {
         self.end.take()
     }
 
+    /// Whether the answer is an error, or never comes.
+    pub(in crate::engine) fn has_failed(&self) -> bool {
+        self.answer.as_ref().map_or(true, |receiver| match &*receiver.borrow() {
+            Some(answer) => answer.is_err(),
+            None => receiver.has_changed().is_err(),
+        })
+    }
+
     /// Waits for the answer. Cancel-safe.
     ///
     /// # Errors

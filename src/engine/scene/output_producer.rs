@@ -199,7 +199,9 @@ impl OutputProducer {
         current: &CurrentStep,
     ) -> SharedPicture {
         let is_equal = |started: &&StartedPicture| started.spec == *spec && started.content.can_serve(content);
-        if let Some(picture) = self.pictures.iter().filter(is_equal).find_map(|started| started.picture.upgrade()) {
+        let mut equal_pictures = self.pictures.iter().filter(is_equal).filter_map(|started| started.picture.upgrade());
+        // A picture that has failed is drawn again.
+        if let Some(picture) = equal_pictures.find(|picture| !picture.has_failed()) {
             return picture;
         }
         self.wait_for_capacity(current).await;
@@ -219,7 +221,7 @@ impl OutputProducer {
         current: &CurrentStep,
     ) -> Arc<PendingReply<Arc<StepVertices>>> {
         let mut copied_attributes = attributes.union(other_attributes);
-        if let Some(copy) = &self.copy {
+        if let Some(copy) = self.copy.as_ref().filter(|copy| !copy.vertices.has_failed()) {
             if copy.attributes.contains(attributes) {
                 return Arc::clone(&copy.vertices);
             }

@@ -300,6 +300,25 @@ async fn late_credit_shares_the_copy_in_flight() {
     expect_no_command(&mut device).await;
 }
 
+/// After an error, a later reader of the same step gets a new copy.
+#[tokio::test]
+async fn failed_copy_is_not_shared() {
+    let (mut delivery, mut device) = delivery_to(Vec::new());
+    let step = current_step(1);
+    for (answer_of_device, is_error) in [(Err(testing::fault_error()), true), (Ok(Arc::default()), false)] {
+        let (reply, answer) = oneshot::channel();
+        let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
+        delivery.add_request(StepRequest { selector: StepSelector::Current, spec, reply });
+        delivery.answer_requests(&step, 1).await;
+        let command = timeout(HANG_GUARD, device.recv()).await.expect("expected a command");
+        let Some(Command::ReadVertices { reply, .. }) = command else { panic!("expected a copy") };
+        assert!(reply.send(answer_of_device), "expected a reader that waits");
+        let output = answer.await.expect("expected an answer").expect("expected no error");
+        let OutputBody::Vertices(vertices) = output.body else { panic!("expected vertices") };
+        assert_eq!(vertices.wait().await.is_err(), is_error);
+    }
+}
+
 /// The second step has no output of its own, and its acknowledgment comes after that of the first.
 #[tokio::test]
 async fn steps_are_acknowledged_in_order_after_their_outputs() {
