@@ -107,7 +107,10 @@ impl SceneCatalog {
 
     /// Releases the lock, so that another server may use the folder.
     pub(in crate::engine) fn release(&self) {
-        lock(&self.folder_lock).take();
+        if let Some(file) = lock(&self.folder_lock).take() {
+            // Closing the file is not enough: a process that is being started holds a copy of it for a moment.
+            file.unlock().ok();
+        }
     }
 
     /// Changes the catalog on disk, and in memory only if that succeeds, so that both agree.
@@ -133,6 +136,12 @@ pub(in crate::engine) fn folder_bytes(folder: &Path) -> u64 {
         _ => entry.metadata().map_or(0, |metadata| metadata.len()),
     };
     fs::read_dir(folder).into_iter().flatten().flatten().map(size).sum()
+}
+
+impl Drop for SceneCatalog {
+    fn drop(&mut self) {
+        self.release();
+    }
 }
 
 #[cfg(test)]
@@ -162,6 +171,17 @@ mod tests {
         // A folder in place of the file is unreadable for every user, root included.
         fs::create_dir(&catalog_path).expect("expected a new folder");
         assert!(matches!(open(folder.path()), Err(Error::Unavailable { .. })));
+    }
+
+    #[test]
+    fn lock_is_released_although_a_process_has_a_copy_of_the_file() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
+        let file = lock(&scene_catalog.folder_lock).as_ref().map(File::try_clone);
+        let _copy = file.expect("expected a lock").expect("expected a copy");
+        assert!(matches!(open(folder.path()), Err(Error::Unavailable { .. })), "control: expected a locked folder");
+        drop(scene_catalog);
+        open(folder.path()).expect("expected an unlocked folder");
     }
 
     #[test]
