@@ -76,6 +76,18 @@ fn without_stage_times(path: &str, mut result: CallResult) -> CallResult {
     result
 }
 
+/// Waits until the last step of a scene is on disk. A list of scenes that is read meanwhile lacks the durable step.
+async fn wait_for_durable_step(server: &Server, name: &str) {
+    loop {
+        let list =
+            server.scenes().await.list_scenes(v1::ListScenesRequest {}).await.expect("expected a list").into_inner();
+        if list.scenes.iter().any(|scene| scene.scene == name && scene.durable_step.is_some()) {
+            return;
+        }
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+}
+
 /// Makes the same call over both transports.
 async fn call_both(
     server: &Server,
@@ -98,6 +110,7 @@ async fn replies_and_errors_are_those_of_grpc() {
     }
     let mut writer = server.drive_lossless("strips").await;
     writer.send_step_and_wait(step(1, &[0], &[0.5, -0.25])).await;
+    with_timeout(wait_for_durable_step(&server, "strips")).await;
     let mut client = WebSocketClient::connect(&server).await;
     let scene = || "strips".to_owned();
     macro_rules! both {
