@@ -44,7 +44,7 @@ pub(super) fn respond_with_description(
             let permit = reply_sender.reserve(MAX_REPLY_BYTES).await?;
             let (scene, selection, hashes) = (Arc::clone(scene), Arc::clone(&selection), hashes.clone());
             let describe = move || {
-                // The lists of what the selected domains use are not kept while the call waits.
+                // Computed again for each part, so that a call that waits holds no lists of domains and shapes.
                 let used = UsedContent::new(&scene, &selection);
                 let description =
                     Description { scene: &scene, selection: &selection, used: &used, hashes: hashes.as_deref() };

@@ -1,5 +1,5 @@
-//! States whose memory is used again, so that a step costs what it changes: a new state copies only the domains in which
-//! a state that nobody reads any longer differs from it.
+//! Reuses the memory of earlier states, so that a step costs what it changes. A new state is made from an earlier one
+//! without readers, and only the domains in which the two differ are copied.
 
 use std::sync::Arc;
 
@@ -35,7 +35,7 @@ impl StatePool {
         state
     }
 
-    /// A copy of `base` that nobody else holds.
+    /// A copy of `base` with a single owner.
     fn copy_of(&mut self, scene: &Scene, base: &Arc<SceneState>) -> Arc<SceneState> {
         let Some(base_index) = self.states.iter().position(|pooled| Arc::ptr_eq(&pooled.state, base)) else {
             // The states of the pool have no known relation to this one.
