@@ -554,7 +554,7 @@ mod tests {
         let names = engine.list().open.iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
         assert_eq!(names, ["control"]);
         let rest_state = Arc::new(modalcast_model::scene::SceneState::rest(&faulty_scene.scene));
-        let deformation = engine.shared.services.device.deform(faulty_scene.id(), &rest_state);
+        let deformation = engine.shared.services.device.deform(faulty_scene.id(), &rest_state, None);
         let error = await_within_limit(deformation.wait()).await.expect_err("expected an unloaded scene").to_string();
         assert!(error.contains("not loaded"), "expected 'not loaded', got {error}");
         assert!(is_done(&send_step(&mut control_writer, 2, 0.5).await), "expected the control scene to continue");

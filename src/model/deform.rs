@@ -10,7 +10,7 @@
 use std::sync::Arc;
 
 use crate::error::{Result, fault};
-use crate::scene::{BoundingBox, OrientedBounds, SceneState};
+use crate::scene::{BoundingBox, FloatingOrigins, OrientedBounds, SceneState};
 use crate::shared_memory::SharedPositions;
 
 /// Deformed vertices of a whole scene, packed as in [`Layout`](crate::scene::Layout). A corner is a vertex with a
@@ -167,13 +167,16 @@ pub struct DeformSummary {
     pub ms: f64,
 }
 
-/// A step that is computed ahead of the call that shows it ([`Deformer::deform_with_next`]).
+/// A step whose positions are in memory that a compute rasterizer can read.
 #[derive(Debug, Clone)]
-pub struct StepAhead {
+pub struct SharedStep {
     pub positions: SharedPositions,
+    /// As [`DeformSummary::bounds`].
     pub bounds: BoundingBox,
+    /// As [`DeformSummary::oriented_bounds`].
     pub oriented_bounds: Option<OrientedBounds>,
-    pub state: Arc<SceneState>,
+    /// As [`SceneState::origins`].
+    pub origins: Option<Arc<FloatingOrigins>>,
 }
 
 /// A deformer for one scene. It owns all data that it needs from the scene.
@@ -187,28 +190,17 @@ pub trait Deformer {
     /// `Fault` if the device fails.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary>;
 
-    /// As [`Self::deform`]. Can also compute `next`, which is probably the state of the next call, so that a device computes
-    /// both at once. The output shows `state` until `next` itself is passed to this method, which then need not compute it.
-    ///
-    /// # Errors
-    /// As for [`Self::deform`].
-    fn deform_with_next(&mut self, state: &Arc<SceneState>, _next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
-        self.deform(state)
-    }
+    /// Announces the state that probably follows the one of the next [`Self::deform`]. A backend may compute both at once.
+    fn announce(&mut self, _following: &Arc<SceneState>) {}
 
-    /// The positions of the last [`Self::deform`], if they are in memory that a compute rasterizer can read. They are valid
-    /// until the next step begins.
-    fn shared_positions(&self) -> Option<SharedPositions> {
-        None
-    }
-
-    /// Waits for the step that [`Self::deform_with_next`] computes ahead. `None` if there is no such step, or its positions
-    /// are not in memory that a compute rasterizer can read.
+    /// The steps that a compute rasterizer can read: the one of the last [`Self::deform`] first, then those that the backend
+    /// has computed before their [`Self::deform`]. Empty if the first one is not in shared memory. Valid until the next
+    /// [`Self::deform`].
     ///
     /// # Errors
     /// `Fault` if the device fails.
-    fn step_ahead(&mut self) -> Result<Option<StepAhead>> {
-        Ok(None)
+    fn shared_steps(&mut self) -> Result<Vec<SharedStep>> {
+        Ok(Vec::new())
     }
 
     /// Whether [`Self::fill_gl_buffers`] can fill the renderer's buffers, so that no upload is needed.

@@ -72,6 +72,6 @@ pub use self::renderer::{
 pub use self::resources::scene_buffers::SceneBuffers;
 pub use self::types::{
     BlurMethod, CullStats, DevicePreference, FrameCullStats, FrameImage, FrameInfo, FrameLook, FrameParams, FrameStats,
-    OitStats, PixelReadback, RasterBackend, RasterBackends, RendererInfo, VisibilityId,
+    OitStats, PixelReadback, RasterBackend, RasterBackends, RendererInfo, SharedFrame, VisibilityId,
 };
 pub use self::uniforms::frame::{shadow_clip_from_world, shadow_texel_axes};

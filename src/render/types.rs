@@ -6,6 +6,7 @@ use crate::pass::{FrameTimes, Pass};
 use modalcast_model::scene::{
     Antialiasing, BoundingBox, Camera, LookPreset, MeshEdges, OrientedBounds, ShadowSettings,
 };
+use modalcast_model::shared_memory::SharedPositions;
 
 /// Selects the EGL device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -70,6 +71,13 @@ pub struct FrameParams {
     /// Samples per pixel, 1 or 4. `None`: as the look, or the rule without a preset, chooses for the size of the frame.
     /// AOVs and picks ignore it.
     pub samples: Option<u32>,
+}
+
+/// A frame whose positions are in shared memory.
+#[derive(Debug, Clone)]
+pub struct SharedFrame {
+    pub params: FrameParams,
+    pub positions: SharedPositions,
 }
 
 /// RGBA8 sRGB pixels of a frame, top row first.

@@ -18,7 +18,7 @@ use modalcast_model::scene::{
 };
 use modalcast_render::{
     FrameImage, FrameParams, MAX_FRAMES_IN_FLIGHT, MappedPixels, RasterBackend, RasterBackends, RenderStage,
-    VisibilityId,
+    SharedFrame, VisibilityId,
 };
 
 use crate::common::exact_triangle::{ExactTriangle, compare_ids};
@@ -359,9 +359,8 @@ fn gpu_cuda_frames_of_steps_ahead_keep_their_step() {
     for step in 0..120 {
         let announced = if step % 7 == 3 { step + 2 } else { step + 1 };
         let next = &shared_states[announced % states.len()];
-        loaded_scene
-            .deform_with_next(&shared_states[step % states.len()], Some(next))
-            .expect("expected the step to succeed");
+        loaded_scene.announce(next);
+        loaded_scene.deform_shared(&shared_states[step % states.len()]).expect("expected the step to succeed");
         if step % 11 == 5 {
             let size = FrameSize::new(SIZE[1], SIZE[1]);
             context.draw(&mut loaded_scene, &other_camera, size).expect("expected a frame");
@@ -400,7 +399,8 @@ fn gpu_frames_of_shared_samples_equal_frames_of_mapped_samples() {
             |mesh: RasterGeometry| Ok(Box::new(CudaRasterizer::new(&device, mesh)?) as Box<dyn Rasterizer>);
         renderer.attach_rasterizer(&mut buffers, create_rasterizer).expect("expected a rasterizer");
         let summary = deformer.deform(&state).expect("expected the step to succeed");
-        let positions = deformer.shared_positions().expect("expected positions in shared memory");
+        let steps = deformer.shared_steps().expect("expected no fault");
+        assert_eq!(steps.len(), 1, "expected positions in shared memory");
         let params = |camera| FrameParams {
             camera,
             width: SIZE[0],
@@ -415,7 +415,8 @@ fn gpu_frames_of_shared_samples_equal_frames_of_mapped_samples() {
         deformer.fill_gl_buffers().expect("expected filled buffers");
         let mut draw = |rasterized: Option<Camera>| {
             if let Some(camera) = rasterized {
-                let rasterized = renderer.rasterize(&buffers, &params(camera), positions.clone(), || Ok(None));
+                let frame = SharedFrame { params: params(camera), positions: steps[0].positions.clone() };
+                let rasterized = renderer.rasterize(&buffers, vec![frame]);
                 rasterized.expect("expected samples");
             }
             let image = renderer.draw(&buffers, &params(camera)).expect("expected a frame");

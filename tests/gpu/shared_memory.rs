@@ -144,7 +144,8 @@ impl Fixture {
         (index, next): (usize, Option<Arc<SceneState>>),
         frames: &mut VecDeque<(usize, PendingFrame)>,
     ) {
-        let deformed = deformer.deform_with_next(&self.states[index], next.as_ref());
+        next.iter().for_each(|next| deformer.announce(next));
+        let deformed = deformer.deform(&self.states[index]);
         let bounds = deformed.expect("expected the step to succeed").bounds;
         deformer.fill_gl_buffers().expect("expected filled buffers");
         let params = frame_params(&self.scene, self.size, bounds);

@@ -75,8 +75,8 @@ pub(in crate::engine) enum Command {
     Deform {
         id: SceneId,
         state: Arc<SceneState>,
-        /// The state that will probably be deformed next.
-        next: Option<Arc<SceneState>>,
+        /// The state that the writer has already sent after this one.
+        following: Option<Arc<SceneState>>,
         reply: Reply<DeformSummary>,
     },
     /// Draws a picture of the last deformation: colors, or an AOV (arbitrary output variable, such as depth).

@@ -354,12 +354,14 @@ impl DeviceLoop {
                     self.unload(id);
                 }
             }
-            Command::Deform { id, state, next, reply } => {
-                // The GPU changes to the context of CUDA once for both.
+            Command::Deform { id, state, following, reply } => {
+                // The GPU changes to the context of CUDA once for encodings and deformation.
                 self.context.start_encodings();
                 let Self { scenes, loss, .. } = self;
-                let deformed = find_scene(scenes, id)
-                    .and_then(|scene| loss.record_step(scene.deform_with_next(&state, next.as_ref())));
+                let deformed = find_scene(scenes, id).and_then(|scene| {
+                    following.iter().for_each(|following| scene.announce(following));
+                    loss.record_step(scene.deform_shared(&state))
+                });
                 answer(reply, deformed);
             }
             Command::UnloadScene { id, reply } => {
@@ -561,7 +563,7 @@ mod tests {
 
     /// Deforms a scene to a state and reads the positions.
     async fn deform_and_read(handle: &DeviceHandle, id: SceneId, state: &Arc<SceneState>) -> Result<Vec<f32>> {
-        handle.deform(id, state).wait().await?;
+        handle.deform(id, state, None).wait().await?;
         handle.read_vertices(id, POSITIONS).wait().await.map(|vertices| vertices.surface.positions.clone())
     }
 

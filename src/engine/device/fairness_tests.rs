@@ -155,7 +155,7 @@ async fn large_frame_does_not_delay_another_scene() {
         let large = fixture.draw(1, LARGE);
         fixture.run(1);
         let state = state_with_q(&fixture.scene, 0.5);
-        let deformed = fixture.handle.deform(2, &state);
+        let deformed = fixture.handle.deform(2, &state, None);
         let mut waited = 0;
         while !is_answered(&deformed).await {
             fixture.run(1);
@@ -179,7 +179,7 @@ async fn long_frame_does_not_delay_another_scene() {
         fixture.device_loop.set_piece_limits(0.0, piece_samples);
         let long = fixture.draw(1, SMALL);
         fixture.run(1);
-        let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+        let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5), None);
         let mut waited = 0;
         while !is_answered(&deformed).await {
             fixture.run(1);
@@ -198,7 +198,7 @@ async fn long_frame_does_not_delay_another_scene() {
 async fn commands_of_a_scene_wait_for_its_large_outputs() {
     let mut fixture = Fixture::start(u64::MAX).await;
     let [whole, deformed_whole] = [fixture.draw(1, LARGE), {
-        fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
+        fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5), None);
         fixture.draw(1, LARGE)
     }];
     fixture.run_all();
@@ -207,7 +207,7 @@ async fn commands_of_a_scene_wait_for_its_large_outputs() {
 
     let mut fixture = Fixture::start(BAND_SAMPLES).await;
     let large = fixture.draw(1, LARGE);
-    let deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5));
+    let deformed = fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5), None);
     let deformed_large = fixture.draw(1, LARGE);
     while fixture.queue.len(1) > 2 {
         assert!(!is_answered(&deformed).await, "expected the deformation to wait for the frame before it");
@@ -246,7 +246,7 @@ async fn cancelled_command_leaves_a_full_queue_at_once() {
     assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
     // A deformation changes the scene, so it is not cancelled.
     drop(draws.remove(0));
-    drop(fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5)));
+    drop(fixture.handle.deform(1, &state_with_q(&fixture.scene, 0.5), None));
     assert_eq!(fixture.queue.len(1), MAX_QUEUED_COMMANDS);
     let command_count = fixture.run_all();
     assert_eq!(command_count, MAX_QUEUED_COMMANDS + 1);
@@ -267,7 +267,7 @@ async fn cancelled_large_output_ends_after_its_draw_step() {
     assert_eq!((fixture.queue.len(1), fixture.device_loop.partial_scene()), (1, Some(1)));
     drop(aov);
     let state = state_with_q(&fixture.scene, 0.5);
-    let deformed = fixture.handle.deform(1, &state);
+    let deformed = fixture.handle.deform(1, &state, None);
     fixture.run(2);
     assert!(is_answered(&deformed).await && fixture.device_loop.partial_scene().is_none());
 }
@@ -302,7 +302,7 @@ async fn first_frame_of_a_scene_has_several_draw_steps() {
         fixture.run(1);
         assert_eq!(fixture.queue.len(1) > 0, is_divided, "{frame} frame: expected draw steps to remain: {is_divided}");
         let state = state_with_q(&fixture.scene, 0.5);
-        let deformed = fixture.handle.deform(2, &state);
+        let deformed = fixture.handle.deform(2, &state, None);
         while !is_answered(&deformed).await {
             fixture.run(1);
         }
@@ -319,7 +319,7 @@ async fn scene_is_prepared_in_steps() {
     let (draw, cancelled_draw) = (fixture.draw(1, SMALL), fixture.draw(1, SMALL));
     fixture.run(1);
     assert_eq!(fixture.queue.len(1), 3, "expected the preparation of programs, and the two frames that need it");
-    let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5));
+    let deformed = fixture.handle.deform(2, &state_with_q(&fixture.scene, 0.5), None);
     while !is_answered(&deformed).await {
         fixture.run(1);
     }

@@ -151,20 +151,15 @@ impl DeviceHandle {
         loaded
     }
 
-    /// Starts deforming a scene to a state.
-    pub(in crate::engine) fn deform(&self, id: SceneId, state: &Arc<SceneState>) -> PendingReply<DeformSummary> {
-        self.deform_with_next(id, state, None)
-    }
-
-    /// Starts deforming a scene to a state. `next` is the state that will probably follow.
-    pub(in crate::engine) fn deform_with_next(
+    /// Starts deforming a scene to a state. `following` is the state that the writer has already sent after it.
+    pub(in crate::engine) fn deform(
         &self,
         id: SceneId,
         state: &Arc<SceneState>,
-        next: Option<Arc<SceneState>>,
+        following: Option<Arc<SceneState>>,
     ) -> PendingReply<DeformSummary> {
         let state = Arc::clone(state);
-        self.submit(|reply| Command::Deform { id, state, next, reply })
+        self.submit(|reply| Command::Deform { id, state, following, reply })
     }
 
     /// Starts drawing a picture of the last deformation. Later commands do not affect it.

@@ -11,12 +11,14 @@ use super::scalar_field;
 use crate::engine::output::output_spec::FrameOutput;
 use crate::frame::{Legend, encode_png};
 use crate::telemetry::ms_since;
-use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, StepAhead, VertexAttributes, VertexReadback};
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, SharedStep, VertexAttributes, VertexReadback};
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{BoundingBox, Camera, FrameSize, OrientedBounds, Scene, SceneState};
-use modalcast_render::{FrameInfo, FrameParams, FramePixels, PendingFrame, Renderer, SceneBuffers, TrialScene};
+use modalcast_model::scene::{BoundingBox, Camera, FloatingOrigins, FrameSize, OrientedBounds, Scene, SceneState};
+use modalcast_render::{
+    FrameInfo, FrameParams, FramePixels, PendingFrame, Renderer, SceneBuffers, SharedFrame, TrialScene,
+};
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
@@ -103,7 +105,7 @@ impl LoadedScene {
     /// # Errors
     /// `Invalid` when the rest state overflows; `Fault` of the device.
     pub(in crate::engine) fn deform_rest(&mut self) -> Result<()> {
-        let deformed = self.run_deformer(&Arc::clone(&self.current_state), None)?;
+        let deformed = self.run_deformer(&Arc::clone(&self.current_state))?;
         if !is_in_range(&deformed.bounds) {
             let expected = format!("vertices within {MAX_COORDINATE:e}");
             return Err(invalid("scene.rest", expected, format!("{:?}", deformed.bounds)));
@@ -127,27 +129,27 @@ impl LoadedScene {
         &self.current_state
     }
 
+    /// Announces the state that probably follows the one of the next [`Self::deform`] ([`Deformer::announce`]).
+    pub fn announce(&mut self, following: &Arc<SceneState>) {
+        self.deformer.announce(following);
+    }
+
     /// Deforms the scene to a state. Rejects the state if a vertex is not finite or beyond 1e18 units. The previous
     /// state is then deformed again, so that no reader sees the rejected one.
     ///
     /// # Errors
     /// `Invalid` naming the domain whose vertices overflow; `Fault` of the device.
     pub fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        self.deform_with_next(&Arc::new(state.clone()), None)
+        self.deform_shared(&Arc::new(state.clone()))
     }
 
-    /// [`Self::deform`] of a shared state, without a copy. `next` is the state that will probably follow
-    /// ([`Deformer::deform_with_next`]).
+    /// [`Self::deform`] without a copy of the state.
     ///
     /// # Errors
     /// As [`Self::deform`].
-    pub fn deform_with_next(
-        &mut self,
-        state: &Arc<SceneState>,
-        next: Option<&Arc<SceneState>>,
-    ) -> Result<DeformSummary> {
+    pub fn deform_shared(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
         self.buffers_are_current = false;
-        let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state, next)));
+        let result = catch_unwind(AssertUnwindSafe(|| self.run_deformer(state)));
         let is_restorable = match &result {
             Ok(Ok(_)) => false,
             Ok(Err(error)) => !error.is_loss(),
@@ -155,7 +157,7 @@ impl LoadedScene {
         };
         if is_restorable {
             // The output may be partially written, so restore it. If that fails too, the first error is more specific.
-            self.run_deformer(&Arc::clone(&self.current_state), None).ok();
+            self.run_deformer(&Arc::clone(&self.current_state)).ok();
         }
         let deformed = result.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
@@ -164,14 +166,14 @@ impl LoadedScene {
             return Ok(deformed);
         }
         let overflow_error = self.overflow_error(state);
-        self.run_deformer(&Arc::clone(&self.current_state), None)?;
+        self.run_deformer(&Arc::clone(&self.current_state))?;
         Err(overflow_error.unwrap_or_else(|error| error))
     }
 
-    fn run_deformer(&mut self, state: &Arc<SceneState>, next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
+    fn run_deformer(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
         self.generation += 1;
         fault_injection::check(InjectionPoint::Deform)?;
-        self.deformer.deform_with_next(state, next)
+        self.deformer.deform(state)
     }
 
     /// The vertices of the last deformation, in host memory.
@@ -191,7 +193,7 @@ impl LoadedScene {
     ) -> Result<BufferContents> {
         let is_uploaded = self.fill_without_rebase(renderer)?;
         let Some(buffers) = &mut self.buffers else { return Err(no_buffers_error()) };
-        let origins = match (uniform_origin(&self.current_state), &self.current_state.origins) {
+        let origins = match (uniform_origin(self.current_state.origins.as_ref()), &self.current_state.origins) {
             (None, Some(origins)) => Arc::clone(origins),
             (origin, _) => {
                 buffers.set_shared_origin(origin.unwrap_or_default());
@@ -207,8 +209,8 @@ impl LoadedScene {
     }
 
     /// Draws the passes of the compute rasterizer for the next frame before OpenGL gets commands, if the positions are
-    /// in shared memory. Also draws those of the step that the deformer has computed ahead, for the same camera. The
-    /// frame must follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
+    /// in shared memory. Also draws those of the other [`Deformer::shared_steps`], for the same camera. The frame must
+    /// follow with the same parameters. `samples`: samples per pixel that the frame sets for itself.
     pub(in crate::engine) fn rasterize(
         &mut self,
         renderer: &mut Renderer,
@@ -216,27 +218,23 @@ impl LoadedScene {
         size: FrameSize,
         samples: Option<u32>,
     ) -> Result<()> {
-        let (Some(buffers), Some(origin)) = (&mut self.buffers, uniform_origin(&self.current_state)) else {
+        let (Some(buffers), Some(origin)) = (&mut self.buffers, uniform_origin(self.current_state.origins.as_ref()))
+        else {
             return Ok(());
         };
         if !buffers.has_compute_rasterizer() {
             return Ok(());
         }
-        let Some(positions) = self.deformer.shared_positions() else { return Ok(()) };
+        let steps = self.deformer.shared_steps()?;
         buffers.set_shared_origin(origin);
         buffers.set_step(self.generation);
-        let contents = BufferContents { bounds: self.bounds, light_bounds: self.light_bounds, is_uploaded: false };
-        let deformer = &mut self.deformer;
-        let ahead = || {
-            let ahead = deformer.step_ahead()?;
-            let ahead = ahead.filter(|step| uniform_origin(&step.state) == Some(origin) && is_in_range(&step.bounds));
-            Ok(ahead.map(|StepAhead { positions, bounds, oriented_bounds: light_bounds, .. }| {
-                let contents = BufferContents { bounds, light_bounds, is_uploaded: false };
-                (FrameParams { samples, ..contents.frame_params(*camera, size) }, positions)
-            }))
-        };
-        let params = FrameParams { samples, ..contents.frame_params(*camera, size) };
-        renderer.rasterize(buffers, &params, positions, ahead)
+        let has_origin = |step: &SharedStep| uniform_origin(step.origins.as_ref()) == Some(origin);
+        let drawable_steps = steps.into_iter().take_while(|step| has_origin(step) && is_in_range(&step.bounds));
+        let frames = drawable_steps.map(|SharedStep { positions, bounds, oriented_bounds: light_bounds, .. }| {
+            let contents = BufferContents { bounds, light_bounds, is_uploaded: false };
+            SharedFrame { params: FrameParams { samples, ..contents.frame_params(*camera, size) }, positions }
+        });
+        renderer.rasterize(buffers, frames.collect())
     }
 
     /// Starts copying attributes of the last deformation to host memory. The copy overlaps with the next deformation.
@@ -414,8 +412,8 @@ impl LoadedScene {
 
 /// The origin of all domains: the scene's origin, or one floating origin. The deformer's output is then drawn
 /// unchanged. `None` if the domains have different origins.
-fn uniform_origin(state: &SceneState) -> Option<[f64; 3]> {
-    match &state.origins {
+fn uniform_origin(origins: Option<&Arc<FloatingOrigins>>) -> Option<[f64; 3]> {
+    match origins {
         Some(origins) => origins.has_no_outliers().then(|| origins.shared_origin()),
         None => Some([0.0; 3]),
     }
@@ -429,7 +427,8 @@ impl TrialScene for LoadedScene {
 
     fn submit(&mut self, renderer: &mut Renderer) -> Result<PendingFrame> {
         let state = Arc::clone(&self.current_state);
-        self.deform_with_next(&state, Some(&state))?;
+        self.announce(&state);
+        self.deform_shared(&state)?;
         let camera = Camera::fit_to_scene(&self.scene, BENCHMARK_SIZE.width, BENCHMARK_SIZE.height);
         self.rasterize(renderer, &camera, BENCHMARK_SIZE, None)?;
         let params = self.fill_buffers(renderer, &camera)?.frame_params(camera, BENCHMARK_SIZE);

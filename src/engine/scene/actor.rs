@@ -276,9 +276,9 @@ impl SceneActor {
             state: self.state_after(&state, &next),
             queued_step: next,
         });
-        let next_state = self.next_step.as_ref().map(|next_step| Arc::clone(&next_step.state));
+        let following = self.next_step.as_ref().map(|next_step| Arc::clone(&next_step.state));
         let merged = queued_step.merged;
-        let pending_summary = self.device.deform_with_next(self.id, &state, next_state);
+        let pending_summary = self.device.deform(self.id, &state, following);
         self.phase = StepPhase::Deforming(DeformingStep { step_queue, merged, stages, state, pending_summary });
         true
     }

@@ -84,7 +84,7 @@ impl SceneHandle {
         services.device.name_scene(id, &name);
         services.device.load_scene(id, &scene, backends).await?;
         let state = match state.map(Arc::new) {
-            Some(state) => match services.device.deform(id, &state).wait().await {
+            Some(state) => match services.device.deform(id, &state, None).wait().await {
                 Ok(_) => state,
                 Err(error) => {
                     tracing::warn!(scene = name, %error, "the checkpoint is not usable; the scene starts at rest");

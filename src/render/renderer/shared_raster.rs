@@ -6,29 +6,23 @@ use crate::pieces::{OutputClass, OutputKind};
 use crate::resources::compute_rasterizer::RasterPasses;
 use crate::resources::scene_buffers::SceneBuffers;
 use crate::resources::shared_targets::StepViews;
-use crate::types::FrameParams;
+use crate::types::SharedFrame;
 use modalcast_model::error::Result;
-use modalcast_model::shared_memory::SharedPositions;
 
 impl Renderer {
     /// Draws the passes of the compute rasterizer for the next frame, which has the same parameters, from positions in
     /// shared memory. Waits for the compute rasterizer, but submits nothing to OpenGL, so that the device changes from
-    /// OpenGL to CUDA only once for a deformation and this call. Also draws the frame of the next step that `ahead` returns,
-    /// so that several frames need one change. Without this call, or after an error of shared memory, the frame itself draws
-    /// these passes into mapped buffers.
+    /// OpenGL to CUDA only once for a deformation and this call. The first of `frames` is the next one. The others show
+    /// later steps, whose passes are also drawn if memory is free, so that several frames need one change. Without this call,
+    /// or after an error of shared memory, the frame itself draws these passes into mapped buffers.
     ///
     /// Does nothing if OpenGL draws all passes, or if the frame may take long and is therefore drawn in pieces.
     ///
     /// # Errors
-    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `DeviceLost`; errors of `ahead`.
-    pub fn rasterize(
-        &mut self,
-        buffers: &SceneBuffers,
-        params: &FrameParams,
-        positions: SharedPositions,
-        ahead: impl FnOnce() -> Result<Option<(FrameParams, SharedPositions)>>,
-    ) -> Result<()> {
+    /// `Invalid` for a size above the limit or a camera whose matrices overflow; `DeviceLost`.
+    pub fn rasterize(&mut self, buffers: &SceneBuffers, frames: Vec<SharedFrame>) -> Result<()> {
         let Some((rasterizer, enabled)) = buffers.active_rasterizer() else { return Ok(()) };
+        let Some(SharedFrame { params, .. }) = frames.first() else { return Ok(()) };
         let _current = self.gl.make_current()?;
         self.check_size(params)?;
         let samples = buffers.antialiasing([params.width, params.height], params.samples).samples;
@@ -40,12 +34,13 @@ impl Renderer {
         if !passes.has_any() || buffers.costs.has_pieces(class, self.output_limits.pieces) {
             return Ok(());
         }
-        let views = raster::views(buffers, params, passes)?;
-        let ahead = || {
-            // The shadow map of another step is always drawn.
-            let Some((params, positions)) = ahead()? else { return Ok(None) };
-            Ok(Some(StepViews { positions, views: raster::views(buffers, &params, enabled)? }))
-        };
-        rasterizer.draw_shared(&self.gl, StepViews { positions, views }, ahead, self.frame_timeout)
+        // The shadow map of a later step is always drawn.
+        let passes_of_frames = std::iter::once(passes).chain(std::iter::repeat(enabled));
+        let steps: Result<_> = (frames.into_iter().zip(passes_of_frames))
+            .map(|(SharedFrame { params, positions }, passes)| {
+                Ok(StepViews { positions, views: raster::views(buffers, &params, passes)? })
+            })
+            .collect();
+        rasterizer.draw_shared(&self.gl, steps?, self.frame_timeout)
     }
 }

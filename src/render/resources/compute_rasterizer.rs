@@ -185,21 +185,15 @@ impl ComputeRasterizer {
         self.run(|rasterizer| rasterizer.draw(depths, keys, first..end))
     }
 
-    /// Draws into shared memory, and makes the result the input of the next frame ([`SharedTargets::draw`]). After an
+    /// Draws into shared memory, and makes the first step the input of the next frame ([`SharedTargets::draw`]). After an
     /// error, the rasterizer maps OpenGL's buffers instead, in this and all later frames.
     ///
     /// # Errors
     /// `DeviceLost`.
-    pub(crate) fn draw_shared(
-        &self,
-        gl: &Rc<Gl>,
-        step: StepViews,
-        ahead: impl FnOnce() -> Result<Option<StepViews>>,
-        limit: Duration,
-    ) -> Result<()> {
+    pub(crate) fn draw_shared(&self, gl: &Rc<Gl>, steps: Vec<StepViews>, limit: Duration) -> Result<()> {
         let mut shared = self.shared.borrow_mut();
         let Some(targets) = shared.as_mut() else { return Ok(()) };
-        match self.run(|rasterizer| targets.draw(gl, rasterizer, step, ahead, limit)) {
+        match self.run(|rasterizer| targets.draw(gl, rasterizer, steps, limit)) {
             Ok(()) => Ok(()),
             Err(lost) if lost.is_loss() => Err(lost),
             Err(error) => {

@@ -158,22 +158,22 @@ impl SharedTargets {
         Self { budget: Arc::clone(budget), free, drawn, current, count, max_count, last_draw }
     }
 
-    /// Makes the set of these views the current one. Draws it unless it was drawn ahead; then also draws the step that
-    /// `ahead` returns, if a set is free and its memory is within the budget, in the same turn of the device. After an
+    /// Makes the set of the first step the current one. Draws it unless it was drawn ahead; then also draws the later
+    /// steps, in the same turn of the device, as long as sets are free and their memory is within the budget. After an
     /// error, this value must be dropped.
     ///
     /// # Errors
-    /// Errors of the rasterizer and of `ahead`; `OutOfMemory`; `Fault` if OpenGL refuses the memory or does not finish
-    /// within `limit`.
+    /// Errors of the rasterizer; `OutOfMemory`; `Fault` if OpenGL refuses the memory or does not finish within `limit`.
     pub(super) fn draw(
         &mut self,
         gl: &Rc<Gl>,
         rasterizer: &mut dyn Rasterizer,
-        step: StepViews,
-        ahead: impl FnOnce() -> Result<Option<StepViews>>,
+        steps: Vec<StepViews>,
         limit: Duration,
     ) -> Result<()> {
         self.release(gl)?;
+        let mut steps = steps.into_iter();
+        let Some(step) = steps.next() else { return Ok(()) };
         self.forget_steps_before(step.positions.step);
         let is_match = |drawn: &DrawnSet| drawn.step == step.positions.step && drawn.views == step.views;
         if let Some(index) = self.drawn.iter().position(is_match) {
@@ -188,10 +188,9 @@ impl SharedTargets {
             }
         };
         let mut sets = vec![(first, step)];
-        if let Some(step) = ahead()?
-            && let Some(set) = self.take_read()
-            && let Some(set) = self.reserve(gl, rasterizer, set, &step.views)?
-        {
+        for step in steps {
+            let Some(set) = self.take_read() else { break };
+            let Some(set) = self.reserve(gl, rasterizer, set, &step.views)? else { break };
             sets.push((set, step));
         }
         let count = sets.len() as f64;

@@ -31,11 +31,11 @@ use crate::gpu::tables::device_tables::{CudaDeformerOptions, DeviceTables};
 use crate::gpu::tables::layout::StepHeader;
 use crate::gpu::tables::plan::{BufferRole, DeformPlan, plan_from_tables};
 use modalcast_model::deform::{
-    Backend, DeformSummary, DeformedSurface, Deformer, StepAhead, VertexAttributes, VertexReadback,
+    Backend, DeformSummary, DeformedSurface, Deformer, SharedStep, VertexAttributes, VertexReadback,
 };
 use modalcast_model::error::{Error, Result, fault};
 use modalcast_model::raster::GlVertexBuffers;
-use modalcast_model::scene::{DirtyDomains, Scene, SceneState};
+use modalcast_model::scene::{DirtyDomains, FloatingOrigins, Scene, SceneState};
 use modalcast_model::shared_memory::SharedPositions;
 
 /// Maximum number of steps in flight.
@@ -72,6 +72,10 @@ pub struct CudaDeformer {
     in_flight: VecDeque<StepInFlight>,
     /// Index in `step_slots` of the step that is shown.
     shown_slot: usize,
+    /// The origins of the step that is shown.
+    shown_origins: Option<Arc<FloatingOrigins>>,
+    /// The state that probably follows the next one.
+    announced: Option<Arc<SceneState>>,
     /// The state of the newest step in flight, if that is a step ahead.
     ahead: Option<Arc<SceneState>>,
     /// Number of steps that were started, including steps ahead.
@@ -170,6 +174,8 @@ impl CudaDeformer {
             displacements,
             in_flight: VecDeque::new(),
             shown_slot: 0,
+            shown_origins: None,
+            announced: None,
             ahead: None,
             started_steps: 0,
             readbacks: ReadbackPool::default(),
@@ -218,6 +224,7 @@ impl CudaDeformer {
         let step = self.start(state, submitted, was_drawn, false).inspect_err(|_| self.invalidate())?;
         if let Some(step) = step {
             self.shown_slot = step.slot;
+            self.shown_origins = state.origins.clone();
             self.in_flight.push_back(step);
         }
         guard.disarm();
@@ -233,6 +240,21 @@ impl CudaDeformer {
         }
         guard.disarm();
         Ok(())
+    }
+
+    /// Waits for a step. `None` if its output is not in shared memory.
+    fn shared_step(
+        &mut self,
+        output: Option<usize>,
+        slot: usize,
+        step: u64,
+        origins: Option<Arc<FloatingOrigins>>,
+    ) -> Result<Option<SharedStep>> {
+        let range = output.and_then(|set| self.output.shared_positions(&self.device, set));
+        let Some(range) = range else { return Ok(None) };
+        let (bounds, oriented_bounds) = self.step_slots[slot].wait().inspect_err(|_| self.invalidate())?;
+        let positions = SharedPositions { range: Rc::new(range), step };
+        Ok(Some(SharedStep { positions, bounds, oriented_bounds, origins }))
     }
 
     /// Whether a step ahead leaves everything that readers of the shown step read: the device has one buffer each for
@@ -468,19 +490,14 @@ impl Deformer for CudaDeformer {
         Backend::Cuda
     }
 
-    /// Also waits for all steps that are in flight.
+    /// Also waits for all steps that are in flight. Computes the announced state, too, if the last step was drawn, so that
+    /// the device computes both in one turn.
     fn deform(&mut self, state: &SceneState) -> Result<DeformSummary> {
-        while self.in_flight.len() == MAX_STEPS_IN_FLIGHT {
-            self.finish()?;
-        }
-        self.submit(state)?;
-        self.finish_shown()
-    }
-
-    /// Computes the next state at once, too, if the last step was drawn, so that the device computes both in one turn.
-    fn deform_with_next(&mut self, state: &Arc<SceneState>, next: Option<&Arc<SceneState>>) -> Result<DeformSummary> {
-        if self.ahead.take_if(|ahead| Arc::ptr_eq(ahead, state)).is_some() {
+        let announced = self.announced.take();
+        // An address identifies a state, because the deformer shares the state of the step ahead.
+        if self.ahead.take_if(|ahead| std::ptr::eq(Arc::as_ptr(ahead), state)).is_some() {
             self.output_ring.show_step_ahead();
+            self.shown_origins = state.origins.clone();
             self.host_attributes = VertexAttributes::default();
             self.readback = None;
             (self.gl_buffers_are_current, self.is_drawn) = (false, false);
@@ -492,27 +509,30 @@ impl Deformer for CudaDeformer {
         }
         let is_drawn = self.is_drawn;
         self.submit(state)?;
-        if let Some(next) = next.filter(|_| is_drawn && self.in_flight.len() == 1 && self.supports_steps_ahead()) {
-            self.submit_ahead(next)?;
+        if let Some(next) = announced.filter(|_| is_drawn && self.in_flight.len() == 1 && self.supports_steps_ahead()) {
+            self.submit_ahead(&next)?;
         }
         self.finish_shown()
     }
 
-    fn shared_positions(&self) -> Option<SharedPositions> {
-        let range = self.output.shared_positions(&self.device, self.output_ring.shown_output()?)?;
-        // A step ahead was started after the one that is shown.
-        Some(SharedPositions { range: Rc::new(range), step: self.started_steps - u64::from(self.ahead.is_some()) })
+    fn announce(&mut self, following: &Arc<SceneState>) {
+        self.announced = Some(Arc::clone(following));
     }
 
-    fn step_ahead(&mut self) -> Result<Option<StepAhead>> {
-        let (Some(state), Some(step)) = (self.ahead.clone(), self.in_flight.back().copied()) else { return Ok(None) };
-        let newest_output = self.output_ring.newest_output();
-        let Some(range) = newest_output.and_then(|set| self.output.shared_positions(&self.device, set)) else {
-            return Ok(None);
+    fn shared_steps(&mut self) -> Result<Vec<SharedStep>> {
+        let output = self.output_ring.shown_output();
+        let shown_step = self.started_steps - u64::from(self.ahead.is_some());
+        let Some(shown) = self.shared_step(output, self.shown_slot, shown_step, self.shown_origins.clone())? else {
+            return Ok(Vec::new());
         };
-        let (bounds, oriented_bounds) = self.step_slots[step.slot].wait().inspect_err(|_| self.invalidate())?;
-        let positions = SharedPositions { range: Rc::new(range), step: self.started_steps };
-        Ok(Some(StepAhead { positions, bounds, oriented_bounds, state }))
+        let ahead = match (self.ahead.clone(), self.in_flight.back().copied()) {
+            (Some(state), Some(step)) => {
+                let output = self.output_ring.newest_output();
+                self.shared_step(output, step.slot, self.started_steps, state.origins.clone())?
+            }
+            _ => None,
+        };
+        Ok(std::iter::once(shown).chain(ahead).collect())
     }
 
     fn fills_gl_buffers(&self) -> bool {

@@ -55,7 +55,7 @@ impl DeviceLoop {
             let owners = Arc::clone(&self.owners);
             let loaded_scene = owners.run_on_device(id, || {
                 let mut loaded_scene = self.context.load_scene(&scene, backends)?;
-                loaded_scene.deform_with_next(&state, None).map(|_| loaded_scene)
+                loaded_scene.deform_shared(&state).map(|_| loaded_scene)
             })?;
             self.insert_scene(id, loaded_scene, backends);
         }

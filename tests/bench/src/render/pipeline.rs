@@ -249,8 +249,10 @@ impl PipelineSetup {
     ) -> Result<()> {
         let mut in_flight = VecDeque::new();
         for step in 0..frames {
-            let next = Some(&self.states[(step + 1) % STATES]).filter(|_| knows_next_step);
-            loaded_scene.deform_with_next(&self.states[step % STATES], next)?;
+            if knows_next_step {
+                loaded_scene.announce(&self.states[(step + 1) % STATES]);
+            }
+            loaded_scene.deform_shared(&self.states[step % STATES])?;
             if in_flight.len() == MAX_FRAMES_IN_FLIGHT
                 && let Some(frame) = in_flight.pop_front()
             {
@@ -267,7 +269,7 @@ impl PipelineSetup {
         let mut wall_us = Vec::new();
         for step in 0..=replays {
             let begin = Instant::now();
-            loaded_scene.deform_with_next(&self.states[step % STATES], None)?;
+            loaded_scene.deform_shared(&self.states[step % STATES])?;
             wall_us.push(begin.elapsed().as_secs_f64() * 1e6);
         }
         wall_us.remove(0);

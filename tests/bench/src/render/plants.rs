@@ -28,7 +28,7 @@ use modalcast_compute::gpu::{CudaDeformer, CudaDeformerOptions, Device};
 use modalcast_model::deform::{Backend, DeformSummary, Deformer, VertexAttributes};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::scene::{Antialiasing, Camera, RenderSettings, Scene, SceneState, ShadowFit, ShadowSettings};
-use modalcast_render::{FrameParams, RasterBackend, RenderStage, SceneBuffers};
+use modalcast_render::{FrameParams, RasterBackend, RenderStage, SceneBuffers, SharedFrame};
 
 /// Results of one plant, with the numbers of the thesis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -286,9 +286,9 @@ fn time_frame(
         edges: None,
         samples: None,
     };
-    if let Some(positions) = setup.deformer.shared_positions() {
-        harness.renderer.rasterize(&setup.buffers, &frame_params, positions, || Ok(None))?;
-    }
+    let frames = setup.deformer.shared_steps()?.into_iter();
+    let frames = frames.map(|step| SharedFrame { params: frame_params, positions: step.positions });
+    harness.renderer.rasterize(&setup.buffers, frames.collect())?;
     let begin = Instant::now();
     let mut upload = 0.0;
     if setup.deformer.fills_gl_buffers() {
