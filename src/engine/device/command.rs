@@ -5,6 +5,7 @@ use std::sync::Arc;
 use tokio::sync::{oneshot, watch};
 
 use super::context::PreparedDeformer;
+use super::fair_queue::CostClass;
 use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_vertices::StepVertices;
@@ -16,14 +17,6 @@ use modalcast_render::PickHit;
 
 /// Identifies a loaded scene on the device thread.
 pub(in crate::engine) type SceneId = u64;
-
-/// Work whose costs are similar: of one kind, with sizes that differ by less than a factor of two.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(super) struct CostClass {
-    pub kind: &'static str,
-    /// Binary logarithm of the number of pixels, rounded down; 0 for work without pixels.
-    pub size_class: u32,
-}
 
 /// The channel that carries a command's answer. Several readers can wait for it.
 #[derive(Debug)]

@@ -8,8 +8,8 @@
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
-use super::command::{Command, CostClass, SceneId};
-use super::fair_queue::{FairQueue, Taken, Ticket};
+use super::command::{Command, SceneId};
+use super::fair_queue::{CostClass, FairQueue, Taken, Ticket};
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result};
 
@@ -26,6 +26,9 @@ pub(super) enum Work {
     Continue,
 }
 
+/// Work that was taken from the queue.
+pub(super) type TakenWork = Taken<SceneId, Work>;
+
 /// A queue between many senders and the device thread.
 pub(super) struct CommandQueue {
     state: Mutex<State>,
@@ -34,7 +37,8 @@ pub(super) struct CommandQueue {
 }
 
 struct State {
-    work: FairQueue<Work>,
+    /// The account that pays for work is its scene.
+    work: FairQueue<SceneId, Work>,
     is_closed: bool,
 }
 
@@ -77,12 +81,12 @@ impl CommandQueue {
     }
 
     /// Puts taken work back at the head of its scene's queue.
-    pub(super) fn return_taken(&self, taken: Taken<Work>) {
+    pub(super) fn return_taken(&self, taken: TakenWork) {
         lock(&self.state).work.return_taken(taken);
     }
 
     /// Takes the work whose turn it is and for which `can_run` returns true.
-    pub(super) fn take(&self, can_run: impl Fn(SceneId, &Work) -> bool) -> Option<Taken<Work>> {
+    pub(super) fn take(&self, can_run: impl Fn(SceneId, &Work) -> bool) -> Option<TakenWork> {
         lock(&self.state).work.take(can_run)
     }
 

@@ -53,10 +53,9 @@ use std::time::{Duration, Instant};
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use super::command::{Command, Reply, SceneId};
-use super::command_queue::{CommandQueue, Work};
+use super::command_queue::{CommandQueue, TakenWork, Work};
 use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loss::DeviceLossSender;
-use super::fair_queue::Taken;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
 use super::partial_output::{Charge, PartialOutput};
@@ -205,10 +204,10 @@ impl DeviceLoop {
     }
 
     /// Executes the work, answers readbacks, and recovers from errors.
-    fn run_taken(&mut self, taken: Taken<Work>) {
+    fn run_taken(&mut self, taken: TakenWork) {
         self.free_in_flight_slot(&taken.work);
         let older_readback_count = self.vertices.len();
-        let (begin, scene, class) = (Instant::now(), taken.scene, taken.class);
+        let (begin, scene, class) = (Instant::now(), taken.account, taken.class);
         self.run_caught_for(scene, |this| this.run_work(taken));
         let ms = ms_since(begin);
         if ms >= LONG_WORK_MS {
@@ -242,7 +241,7 @@ impl DeviceLoop {
     }
 
     /// Takes the next work. While no work can run, answers readbacks in flight.
-    fn next_work(&mut self) -> Option<Taken<Work>> {
+    fn next_work(&mut self) -> Option<TakenWork> {
         loop {
             // Polled before the queue is locked. A draw step waits for those of all scenes, so that a command never
             // waits for more than one.
@@ -316,13 +315,13 @@ impl DeviceLoop {
     }
 
     /// Executes a command or the next draw step of an output, and charges its scene the time.
-    fn run_work(&mut self, taken: Taken<Work>) {
+    fn run_work(&mut self, taken: TakenWork) {
         let begin = Instant::now();
         let taken = match self.prepare(taken) {
             Some(taken) => taken,
             None => return,
         };
-        let Taken { scene: id, class, charged_ms, work, .. } = taken;
+        let TakenWork { account: id, class, charged_ms, work, .. } = taken;
         match work {
             Work::Command(command) | Work::Prepared(command) if command.is_cancelled() => drop(command),
             // The costs of outputs are recorded when they are finished.

@@ -6,8 +6,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::command::{CostClass, Reply};
+use super::command::Reply;
 use super::context::{DeviceContext, PartialAovDraw};
+use super::fair_queue::CostClass;
 use super::loaded_scene::LoadedScene;
 use crate::engine::output::output_spec::PictureContent;
 use crate::engine::output::rendered_picture::RenderedPicture;

@@ -6,8 +6,7 @@ use std::time::Instant;
 
 use super::{DeviceLoop, answer, find_scene};
 use crate::engine::device::command::{Command, SceneId};
-use crate::engine::device::command_queue::Work;
-use crate::engine::device::fair_queue::Taken;
+use crate::engine::device::command_queue::{TakenWork, Work};
 use crate::engine::device::in_flight::InFlight;
 use crate::engine::device::partial_output::{Charge, PartialKind, PartialOutput};
 use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
@@ -19,14 +18,14 @@ impl DeviceLoop {
     /// Returns work that can run. If a command needs textures or programs that are not on the device yet, begins to
     /// prepare them in steps and returns `None`; the command runs after the last step. A command is prepared only once:
     /// if the preparation fails, the command runs and returns the error.
-    pub(super) fn prepare(&mut self, taken: Taken<Work>) -> Option<Taken<Work>> {
+    pub(super) fn prepare(&mut self, taken: TakenWork) -> Option<TakenWork> {
         let preparation = match &taken.work {
             Work::Command(command) if self.loss.error().is_none() => self.begin_preparation(command),
             _ => None,
         };
         let Some(preparation) = preparation else { return Some(taken) };
-        let Taken { scene: id, class, .. } = taken;
-        self.queue.return_taken(Taken {
+        let TakenWork { account: id, class, .. } = taken;
+        self.queue.return_taken(TakenWork {
             work: match taken.work {
                 Work::Command(command) => Work::Prepared(command),
                 work => work,
