@@ -36,7 +36,7 @@ async fn send_steps(scene: Arc<SceneHandle>, q: f32) {
     for number in 1.. {
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[q, 0.0]));
         let step = RawStepUpdate { number, q_domains: vec![0], q, ..RawStepUpdate::default() };
-        if writer.push_step(&step).is_err() || writer.next_report().await.is_err() {
+        if writer.push_step(step).await.is_err() || writer.next_report().await.is_err() {
             return;
         }
     }

@@ -509,7 +509,7 @@ mod tests {
 
     /// Sends one step and waits for its report.
     async fn send_step(writer: &mut WriterSession, number: u64, q: f32) -> Result<StepReport> {
-        writer.push_step(&step(number, q))?;
+        writer.push_step(step(number, q)).await?;
         await_within_limit(writer.next_report()).await
     }
 
@@ -543,7 +543,7 @@ mod tests {
         assert!(output.as_ref().is_err_and(is_panic), "pending request: expected the panic, got {output:?}");
         let report = await_within_limit(faulty_writer.next_report()).await;
         assert!(report.as_ref().is_err_and(is_panic), "writer: expected the panic, got {report:?}");
-        assert!(faulty_writer.push_step(&step(2, 0.5)).is_err_and(|error| is_panic(&error)));
+        assert!(faulty_writer.push_step(step(2, 0.5)).await.is_err_and(|error| is_panic(&error)));
         let end = await_within_limit(subscription.next()).await;
         assert!(end.as_ref().is_err_and(is_panic), "subscription: expected the panic, got {end:?}");
         let new_subscription = await_within_limit(faulty_scene.subscribe(POSITIONS, Delivery::Latest)).await;
@@ -694,9 +694,9 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let (engine, faulty_scene, _) = start_faulty_engine(folder.path()).await;
         let mut writer = acquire_writer(&faulty_scene).await;
-        writer.push_step(&step(1, 0.25)).expect("expected capacity");
-        writer.push_step(&step(2, InjectedFault::PanicInDeform.q())).expect("expected capacity");
-        writer.push_step(&RawStepUpdate { q_domains: vec![1], ..step(3, 0.5) }).expect("expected capacity");
+        writer.push_step(step(1, 0.25)).await.expect("expected capacity");
+        writer.push_step(step(2, InjectedFault::PanicInDeform.q())).await.expect("expected capacity");
+        writer.push_step(RawStepUpdate { q_domains: vec![1], ..step(3, 0.5) }).await.expect("expected capacity");
         assert!(is_done(&await_within_limit(writer.next_report()).await));
         let report = await_within_limit(writer.next_report()).await;
         assert!(matches!(report, Ok(StepReport::Rejected { step: 2, .. })), "{report:?}");

@@ -264,7 +264,7 @@ mod tests {
         assert_eq!(next_status(&mut watch).await, ServingStatus::Serving as i32);
         let scene_handle = engine.find("strips").expect("expected an open scene");
         let mut writer = scene_handle.drive("test", lossless_lease(4)).await.expect("expected the writer lease");
-        writer.push_step(&step).expect("expected an accepted step");
+        writer.push_step(step).await.expect("expected an accepted step");
         assert_eq!(next_status(&mut watch).await, ServingStatus::NotServing as i32);
         let error = server.await.expect("expected no panic").expect_err("expected the end of the server");
         assert!(matches!(error, Error::DeviceLost { .. }), "{error}");

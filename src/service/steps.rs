@@ -128,7 +128,7 @@ impl DriveSession {
             Some(RequestKind::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
             Some(RequestKind::Step(step)) => {
                 let number = step.number;
-                self.push_step(step).err().map(|error| (Some(number), error))
+                self.push_step(step).await.err().map(|error| (Some(number), error))
             }
             None => Some((None, Error::UnexpectedMessage { expected: "open or step", given: "an empty message" })),
         };
@@ -151,10 +151,10 @@ impl DriveSession {
         Ok(())
     }
 
-    fn push_step(&mut self, step: v1::Step) -> Result<()> {
+    async fn push_step(&mut self, step: v1::Step) -> Result<()> {
         let Some(step) = self.parts.push(step)? else { return Ok(()) };
         match &mut self.writer {
-            Some(writer) => writer.push_step(&parse_step(step)?),
+            Some(writer) => writer.push_step(parse_step(step)?).await,
             None => Err(Error::UnexpectedMessage { expected: "open before the first step", given: "a step" }),
         }
     }

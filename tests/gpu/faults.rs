@@ -129,7 +129,7 @@ async fn send(writer: &mut WriterSession, scene: &SceneHandle, number: u64, valu
     let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&q));
     let q_domains = vec![u32::try_from(domain).expect("expected a small index")];
     let step = RawStepUpdate { number, time: number as f64, q_domains, q, ..RawStepUpdate::default() };
-    writer.push_step(&step).expect("expected capacity");
+    writer.push_step(step).await.expect("expected capacity");
     match writer.next_report().await {
         Ok(StepReport::Done { .. }) => None,
         Ok(StepReport::Rejected { error, .. }) | Err(error) => Some(error),

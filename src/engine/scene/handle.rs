@@ -26,6 +26,9 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::{RawStepUpdate, Scene, SceneState, StepUpdate};
 
+/// Bytes of a step up to which the network's thread validates it itself.
+const INLINE_STEP_BYTES: usize = 128 << 10;
+
 /// Capacity of a scene's mailbox in messages.
 const MAILBOX_CAPACITY: usize = 128;
 
@@ -186,7 +189,7 @@ impl SceneHandle {
             initial_state: Some(InitialState::Reset),
         };
         let mut writer = self.drive(peer, request).await?;
-        writer.push_step(&RawStepUpdate::default())?;
+        writer.push_step(RawStepUpdate::default()).await?;
         match writer.next_report().await? {
             StepReport::Done { step, .. } => Ok(StepId { run: writer.run, number: step, time: 0.0 }),
             StepReport::Rejected { error, .. } => Err(error),
@@ -323,19 +326,26 @@ pub struct WriterSession {
 }
 
 impl WriterSession {
-    /// Validates and queues a step. A rejected step has no effect.
+    /// Validates and queues a step. A rejected step has no effect. A large step is validated on another thread, because it
+    /// takes milliseconds.
     ///
     /// # Errors
     /// `Invalid` for a malformed step; `WindowFull` for a step beyond the window; the error with which the server ended
     /// the stream.
-    pub fn push_step(&mut self, raw: &RawStepUpdate) -> Result<()> {
+    pub async fn push_step(&mut self, raw: RawStepUpdate) -> Result<()> {
         let begin = Instant::now();
         if let Some(last_number) = self.last_number.filter(|last_number| raw.number <= *last_number) {
             return Err(invalid("step.number", format!("a number above {last_number}"), raw.number));
         }
-        let update = StepUpdate::parse(&self.scene, raw)?;
+        let number = raw.number;
+        let update = if raw.q.len() + raw.transforms.len() > INLINE_STEP_BYTES {
+            let scene = Arc::clone(&self.scene);
+            run_blocking("step", move || StepUpdate::parse(&scene, &raw)).await?
+        } else {
+            StepUpdate::parse(&self.scene, &raw)?
+        };
         self.lease.step_queue.push(QueuedStep::new(update, ms_since(begin)))?;
-        self.last_number = Some(raw.number);
+        self.last_number = Some(number);
         Ok(())
     }
 

@@ -100,8 +100,8 @@ impl TestScene {
     }
 }
 
-fn push_step(writer: &mut WriterSession, number: u64) {
-    writer.push_step(&RawStepUpdate { number, ..RawStepUpdate::default() }).expect("expected capacity");
+async fn push_step(writer: &mut WriterSession, number: u64) {
+    writer.push_step(RawStepUpdate { number, ..RawStepUpdate::default() }).await.expect("expected capacity");
 }
 
 /// The picture of the next step, which may not be drawn yet.
@@ -131,13 +131,13 @@ async fn credit_during_back_pressure_shares_the_frame_in_flight() {
     let mut second = scene.subscribe(Delivery::Lossless).await;
     let mut writer = scene.handle.drive("test", testing::lossless_lease(8)).await.expect("expected the lease");
     for number in 1..=2 {
-        push_step(&mut writer, number);
+        push_step(&mut writer, number).await;
         scene.deform().await;
         let finish = scene.draw().await;
         finish();
         assert_eq!(receive(&mut first).await, number);
     }
-    push_step(&mut writer, 3);
+    push_step(&mut writer, 3).await;
     scene.deform().await;
     let finish = scene.draw().await;
     assert_eq!(receive(&mut second).await, 1);
@@ -157,7 +157,7 @@ async fn credit_without_a_queued_step_shares_the_frame_in_flight() {
     let mut first = scene.subscribe(Delivery::Lossless).await;
     let mut second = scene.subscribe(Delivery::Latest).await;
     let mut writer = scene.handle.drive("test", testing::lossless_lease(8)).await.expect("expected the lease");
-    push_step(&mut writer, 1);
+    push_step(&mut writer, 1).await;
     scene.deform().await;
     let finish = scene.draw().await;
     // Polling grants the credit. The result is there before its picture.
