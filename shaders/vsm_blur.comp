@@ -4,6 +4,7 @@
 // only once. `blur_separable` in src/render/shaders/shadow.rs generates the function `blur`.
 layout(local_size_x = WORKGROUP_SIZE) in;
 layout(FORMAT, binding = 0) uniform writeonly image2D destination;
+layout(location = 2) uniform int band_row; // first row of the map that this dispatch writes
 
 void main() {
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
@@ -15,6 +16,7 @@ void main() {
 #endif
     // First texel of this invocation: multiplies its index along the direction by TEXELS_PER_INVOCATION.
     texel += (TEXELS_PER_INVOCATION - 1) * texel * direction;
+    texel.y += band_row;
     if (texel.x >= side) return;
     vec2 sums[TEXELS_PER_INVOCATION];
     blur(texel, direction, side, sums);

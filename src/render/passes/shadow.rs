@@ -10,7 +10,7 @@ use crate::pieces::PieceRange;
 use crate::region::{Band, Region};
 use crate::resources::compute_rasterizer::ComputeRasterizer;
 use crate::resources::scene_buffers::SceneBuffers;
-use crate::resources::shadow_map::ShadowMap;
+use crate::resources::shadow_map::{BlurredMoments, ShadowMap};
 use crate::scene_data::geometry::BlendMode;
 use crate::shaders::shadow::{TEXELS_PER_INVOCATION, texels_per_workgroup};
 use crate::types::RasterBackend;
@@ -56,13 +56,14 @@ pub(crate) fn draw_depth(
 
 /// Bands of a layer of the map that [`blur`] blurs without a break, of at most `max_texels` texels.
 pub(crate) fn blur_bands(map: &ShadowMap, max_texels: u64) -> Vec<Band> {
-    let is_divisible = map.blurred.as_ref().is_some_and(|blurred| blurred.horizontal.is_none());
     let size = map.shadow.size;
-    match is_divisible {
-        true => Band::divide_aligned([size; 2], max_texels, texels_per_workgroup(&map.shadow)[1]),
-        // The other methods are for measurements.
-        false => vec![Band::whole(size)],
-    }
+    let alignment = match &map.blurred {
+        Some(BlurredMoments { horizontal: None, .. }) => texels_per_workgroup(&map.shadow)[1],
+        Some(BlurredMoments { framebuffers, .. }) if framebuffers.is_empty() => TEXELS_PER_INVOCATION,
+        // Fragment passes are for measurements.
+        _ => return vec![Band::whole(size)],
+    };
+    Band::divide_aligned([size; 2], max_texels, alignment)
 }
 
 /// Blurs the moments of the depth in a band of a layer. Does nothing for maps without moments.
@@ -90,16 +91,21 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, laye
         }
         // Two compute passes.
         ([x_program, y_program], Some(horizontal)) if blurred.framebuffers.is_empty() => {
-            let (size, invocations_per_line) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
-            // Wait until the previous layer has read `horizontal`.
+            let (size, invocations_per_row) = (map.shadow.size, map.shadow.size.div_ceil(TEXELS_PER_INVOCATION));
+            // The blur in y also reads the rows around the band.
+            let first_row = band.first_row.saturating_sub(map.shadow.blur_radius());
+            let end_row = (band.first_row + band.rows + map.shadow.blur_radius()).min(size);
+            // Wait until the previous band has read `horizontal`.
             recorder.barrier_within_pass(Pass::Blur);
             bind_blur(x_program, &map.depth, map, layer);
+            x_program.set_first_row(first_row);
             horizontal.bind_image(DESTINATION_IMAGE);
-            gl.dispatch(invocations_per_line.div_ceil(WORKGROUP_SIZE), size);
+            gl.dispatch(invocations_per_row.div_ceil(WORKGROUP_SIZE), end_row - first_row);
             recorder.barrier_within_pass(Pass::Blur);
             bind_blur(y_program, horizontal, map, layer);
+            y_program.set_first_row(band.first_row);
             blurred.moments.bind_image_layer(DESTINATION_IMAGE, layer);
-            gl.dispatch(size.div_ceil(WORKGROUP_SIZE), invocations_per_line);
+            gl.dispatch(size.div_ceil(WORKGROUP_SIZE), band.rows.div_ceil(TEXELS_PER_INVOCATION));
         }
         // Two fragment passes. Framebuffer 0 is that of `horizontal`; framebuffer 1 + i is that of layer i of
         // `moments`.
