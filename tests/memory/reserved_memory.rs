@@ -265,6 +265,7 @@ fn loaders_allocate_no_more_than_they_have_reserved() {
     write("creases.obj", obj_grid(true).as_bytes());
     write("separate.obj", obj_separate_triangles().as_bytes());
     write("stars.obj", obj_stars(256, 250).as_bytes());
+    write("large_stars.obj", obj_stars(5000, 12).as_bytes());
     write("pentagons.obj", obj_stars(6, 10_000).as_bytes());
     write("attributes.obj", obj_with_attributes().as_bytes());
     write("colors.obj", obj_with_colors().as_bytes());
@@ -281,6 +282,7 @@ fn loaders_allocate_no_more_than_they_have_reserved() {
         "creases.obj",
         "separate.obj",
         "stars.obj",
+        "large_stars.obj",
         "pentagons.obj",
         "attributes.obj",
         "colors.obj",

@@ -52,6 +52,7 @@ pub(super) fn add_domain(
     };
     files.reserve(&format!("mesh of '{name}'"), polygons.build_bytes())?;
     let triangles = polygons::build_all_faces(polygons, options.crease_angle).map_err(in_file(name))?;
+    parts.remarks.extend(triangles.remark());
     let mesh = color_vertices(polygons, triangles.mesh, parts).map_err(in_file(name))?;
     let (loaded, modes_file) = match (options.modes, own_modes) {
         (ModesSource::None, _) => (Modes::rigid().into(), None),

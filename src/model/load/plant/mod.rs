@@ -107,6 +107,7 @@ impl PlantBuilder<'_> {
         let faces = self.faces_by_organ.remove(&organ).unwrap_or_default();
         let triangle_mesh = polygons::build_faces(self.polygons, &faces, origin, self.crease_angle)
             .map_err(|error| error.prefix_field(&name))?;
+        self.parts.remarks.extend(triangle_mesh.remark().map(|remark| format!("{name}: {remark}")));
         self.parts.shapes.push(Shape::new(triangle_mesh.mesh, Modes::rigid())?);
         let attachment =
             parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 
-use super::triangulate::triangulate;
+use super::triangulate::{Triangulation, triangulate};
 use super::{Corner, NO_INDEX, PolygonMesh};
 use crate::domain::{Corners, CreaseAngle, MaterialRange, Mesh, split_at_creases};
 use crate::error::Result;
@@ -15,6 +15,8 @@ pub(in crate::load) struct TriangleMesh {
     pub(in crate::load) material: usize,
     /// The ranges of all materials; empty if there is only one material.
     pub(in crate::load) material_ranges: Vec<MaterialRange>,
+    /// Number of polygons that are drawn as a fan, because they intersect themselves too often.
+    inexact_polygons: usize,
 }
 
 /// Builds a mesh from all faces. Its vertices are all `v` lines in file order, whether referenced or not.
@@ -66,6 +68,17 @@ struct MeshBuilder<'a> {
     /// As [`Mesh::inner_edges`].
     inner_edges: Vec<u8>,
     material_ranges: Vec<MaterialRange>,
+    /// As [`TriangleMesh::inexact_polygons`].
+    inexact_polygons: usize,
+}
+
+impl TriangleMesh {
+    /// A remark on the polygons that are not drawn as the file describes them.
+    pub(in crate::load) fn remark(&self) -> Option<String> {
+        let count = self.inexact_polygons;
+        let text = || format!("{count} polygons intersect themselves too often: they are drawn as fans of triangles");
+        (count > 0).then(text)
+    }
 }
 
 impl<'a> MeshBuilder<'a> {
@@ -80,6 +93,7 @@ impl<'a> MeshBuilder<'a> {
             triangles: Vec::new(),
             inner_edges: Vec::new(),
             material_ranges: Vec::new(),
+            inexact_polygons: 0,
         }
     }
 
@@ -100,7 +114,9 @@ impl<'a> MeshBuilder<'a> {
         let corners = self.polygons.corners_of(face);
         let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.vertex as usize]).collect();
         let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
-        for triangle in triangulate(&positions) {
+        let Triangulation { triangles, is_inexact } = triangulate(&positions);
+        self.inexact_polygons += usize::from(is_inexact);
+        for triangle in triangles {
             self.triangles.push(triangle.map(|index| corner_indices[index]));
             self.inner_edges.push(inner_edges(triangle, corners.len()));
         }
@@ -137,7 +153,7 @@ impl<'a> MeshBuilder<'a> {
         let mesh =
             Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?
                 .with_inner_edges(self.inner_edges)?;
-        Ok(TriangleMesh { mesh, material, material_ranges })
+        Ok(TriangleMesh { mesh, material, material_ranges, inexact_polygons: self.inexact_polygons })
     }
 
     /// The normals of the corners. Corners whose normal is missing or zero in the file are split at creases.

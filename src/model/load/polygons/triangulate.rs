@@ -2,23 +2,27 @@
 
 use nalgebra::{Vector2, Vector3};
 
-/// The largest polygon that is triangulated by ear clipping, which takes quadratic time. A larger polygon is split into
-/// a fan. So the time for a file is at most proportional to its number of corners.
-const MAX_EAR_CLIPPING_CORNERS: usize = 256;
+use super::delaunay::triangulate_plane;
 
-/// The largest number of repeated searches for the ears of all corners. A simple polygon needs none.
-const MAX_EAR_SEARCHES: usize = 4;
+/// The triangles of a polygon.
+#[derive(Debug)]
+pub(super) struct Triangulation {
+    /// Indices of points, with the polygon's winding.
+    pub(super) triangles: Vec<[usize; 3]>,
+    /// Whether the triangles are a fan that covers more than the polygon, because it intersects itself too often.
+    pub(super) is_inexact: bool,
+}
 
-/// Splits a polygon into triangles with the polygon's winding, as indices into `points`. There are always two fewer
-/// triangles than points.
+/// Splits a polygon into triangles. Takes O(n log n) time for n points.
 ///
 /// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a
-/// quadrilateral is split along its other diagonal, and a larger polygon by ear clipping in the plane of its normal
-/// (Newell's method).
-pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
-    let fan = |count: usize| (2..count).map(|index| [0, index - 1, index]).collect::<Vec<_>>();
+/// quadrilateral is split along its other diagonal, and a larger polygon in the plane of its normal (Newell's method). The
+/// triangles of a polygon with a hole, whose outline runs to the hole and back, do not cover the hole.
+pub(super) fn triangulate(points: &[[f32; 3]]) -> Triangulation {
+    let fan: Vec<_> = (2..points.len()).map(|index| [0, index - 1, index]).collect();
+    let exact = |triangles| Triangulation { triangles, is_inexact: false };
     if points.len() <= 3 {
-        return fan(points.len());
+        return exact(fan);
     }
     let points: Vec<_> = points.iter().map(|point| Vector3::from(*point).cast::<f64>()).collect();
     let normal = newell_normal(&points);
@@ -26,15 +30,17 @@ pub(super) fn triangulate(points: &[[f32; 3]]) -> Vec<[usize; 3]> {
         let [a, b, c] = triangle.map(|index| points[index]);
         (b - a).cross(&(c - a)).dot(&normal) > 0.0
     };
-    let first_fan = fan(points.len());
-    if first_fan.iter().all(has_polygon_orientation) || points.len() > MAX_EAR_CLIPPING_CORNERS {
-        return first_fan;
+    if fan.iter().all(has_polygon_orientation) || normal == Vector3::zeros() {
+        return exact(fan);
     }
     if points.len() == 4 {
         let other_split = vec![[1, 2, 3], [1, 3, 0]];
-        return if other_split.iter().all(has_polygon_orientation) { other_split } else { first_fan };
+        return exact(if other_split.iter().all(has_polygon_orientation) { other_split } else { fan });
     }
-    ear_clip(&project_to_plane(&points, normal))
+    match triangulate_plane(&project_to_plane(&points, normal)) {
+        Some(triangles) => exact(triangles),
+        None => Triangulation { triangles: fan, is_inexact: true },
+    }
 }
 
 /// Twice the area vector; zero for a polygon without area.
@@ -50,82 +56,6 @@ fn project_to_plane(points: &[Vector3<f64>], normal: Vector3<f64>) -> Vec<Vector
     let (first_axis, second_axis) = ((dropped_axis + 1) % 3, (dropped_axis + 2) % 3);
     let sign = if normal[dropped_axis] < 0.0 { -1.0 } else { 1.0 };
     points.iter().map(|point| Vector2::new(point[first_axis], sign * point[second_axis])).collect()
-}
-
-/// Cuts the first ear until a triangle remains. Only reflex corners can lie in an ear, and a cut changes the angles and
-/// ears of no corners but its two neighbors (Eberly, Triangulation by Ear Clipping).
-fn ear_clip(points: &[Vector2<f64>]) -> Vec<[usize; 3]> {
-    let mut outline = Outline { points, remaining: (0..points.len()).collect(), is_reflex: Vec::new() };
-    outline.is_reflex = (0..points.len()).map(|position| outline.is_reflex_at(position)).collect();
-    let mut is_ear: Vec<bool> = outline.find_ears();
-    let mut remaining_searches = MAX_EAR_SEARCHES;
-    let mut triangles = Vec::with_capacity(points.len().saturating_sub(2));
-    while outline.remaining.len() > 3 {
-        let mut position = is_ear.iter().position(|is_ear| *is_ear);
-        if position.is_none() && remaining_searches > 0 {
-            remaining_searches -= 1;
-            is_ear = outline.find_ears();
-            position = is_ear.iter().position(|is_ear| *is_ear);
-        }
-        // A self-intersecting polygon may have no ear. In this case, cut any corner, so that no triangle is lost.
-        let position = position.unwrap_or(1);
-        triangles.push(outline.triangle_at(position));
-        outline.remaining.remove(position);
-        is_ear.remove(position);
-        let count = outline.remaining.len();
-        let neighbors = [(position + count - 1) % count, position % count];
-        for neighbor in neighbors {
-            outline.is_reflex[outline.remaining[neighbor]] = outline.is_reflex_at(neighbor);
-        }
-        for neighbor in neighbors {
-            is_ear[neighbor] = outline.is_ear_at(neighbor);
-        }
-    }
-    triangles.push([outline.remaining[0], outline.remaining[1], outline.remaining[2]]);
-    triangles
-}
-
-/// A polygon of which corners are cut off.
-struct Outline<'a> {
-    points: &'a [Vector2<f64>],
-    /// Indices into `points` of the corners that are not cut off, in order.
-    remaining: Vec<usize>,
-    /// For each point, whether its corner is not convex.
-    is_reflex: Vec<bool>,
-}
-
-impl Outline<'_> {
-    /// The corner at a position of `remaining`, between its neighbors.
-    fn triangle_at(&self, position: usize) -> [usize; 3] {
-        let (corners, count) = (&self.remaining, self.remaining.len());
-        [corners[(position + count - 1) % count], corners[position], corners[(position + 1) % count]]
-    }
-
-    fn is_reflex_at(&self, position: usize) -> bool {
-        signed_area2(self.triangle_at(position).map(|index| self.points[index])) <= 0.0
-    }
-
-    fn is_ear_at(&self, position: usize) -> bool {
-        let ear = self.triangle_at(position);
-        let corners = ear.map(|index| self.points[index]);
-        let is_inside = |index: &usize| {
-            self.is_reflex[*index] && !ear.contains(index) && contains_point(self.points[*index], corners)
-        };
-        !self.is_reflex[ear[1]] && !self.remaining.iter().any(is_inside)
-    }
-
-    fn find_ears(&self) -> Vec<bool> {
-        (0..self.remaining.len()).map(|position| self.is_ear_at(position)).collect()
-    }
-}
-
-/// Twice the signed area of a triangle, positive if counterclockwise.
-fn signed_area2([a, b, c]: [Vector2<f64>; 3]) -> f64 {
-    (b - a).perp(&(c - a))
-}
-
-fn contains_point(point: Vector2<f64>, [a, b, c]: [Vector2<f64>; 3]) -> bool {
-    signed_area2([a, b, point]) >= 0.0 && signed_area2([b, c, point]) >= 0.0 && signed_area2([c, a, point]) >= 0.0
 }
 
 #[cfg(test)]
@@ -151,7 +81,7 @@ mod tests {
             for shift in 0..polygon.len() {
                 let mut rotated = polygon.to_vec();
                 rotated.rotate_left(shift);
-                let triangles = triangulate(&rotated);
+                let triangles = triangulate(&rotated).triangles;
                 assert_eq!(triangles.len(), polygon.len() - 2);
                 for area in signed_and_absolute_area(&rotated, &triangles) {
                     assert!((area - polygon_area).abs() < 1e-9, "{shift}: expected {polygon_area}, got {area}");
@@ -171,7 +101,7 @@ mod tests {
         let inner = angles.rev().map(|angle| (0.9999, angle));
         let point = |(radius, angle): (f64, f64)| [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32, 0.0];
         let arc: Vec<_> = outer.chain(inner).map(point).collect();
-        let triangles = triangulate(&arc);
+        let triangles = triangulate(&arc).triangles;
         assert_eq!(triangles.len(), 254);
         let [signed, absolute] = signed_and_absolute_area(&arc, &triangles);
         assert!((signed - absolute).abs() < 1e-9, "expected no overlap, got {signed} and {absolute}");
@@ -180,16 +110,102 @@ mod tests {
         assert!((signed - expected).abs() < 0.01 * expected, "expected about {expected}, got {signed}");
     }
 
+    /// Polygons above 256 corners: simple, with a hole that the outline runs to and back, far from the origin, and in another
+    /// plane.
     #[test]
-    fn degenerate_and_huge_polygons_have_two_fewer_triangles() {
+    fn large_polygons_are_covered_once() {
+        let gear = |corner_count: usize| {
+            let point = move |index: usize| {
+                let (angle, radius) =
+                    (std::f64::consts::TAU * index as f64 / corner_count as f64, [1.0, 0.8][index / 2 % 2]);
+                [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32, 0.0]
+            };
+            (0..corner_count).map(point).collect::<Vec<_>>()
+        };
+        let hole = gear(300).into_iter().map(|[x, y, z]| [0.5 * x, 0.5 * y, z]);
+        let outer = gear(400);
+        let mut inner: Vec<_> = hole.rev().collect();
+        inner.push(inner[0]);
+        let with_hole = [&outer[..], &[outer[0]], &inner].concat();
+        let spiral =
+            |offset: f64| (0..50_000).map(move |index| (f64::from(index) * 0.05, f64::from(index) * 0.05 + offset));
+        let outline = spiral(4.0).chain(spiral(1.0).rev());
+        let spiral: Vec<_> = outline
+            .map(|(angle, radius)| [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32, 0.0])
+            .collect();
+        for polygon in
+            [gear(260), with_hole, gear(1000).into_iter().map(|[x, y, _]| [x + 100.0, y, 7.0]).collect(), spiral]
+        {
+            let expected =
+                newell_normal(&polygon.iter().map(|point| Vector3::from(*point).cast()).collect::<Vec<_>>()).z / 2.0;
+            let Triangulation { triangles, is_inexact } = triangulate(&polygon);
+            assert_eq!((triangles.len(), is_inexact), (polygon.len() - 2, false));
+            for area in signed_and_absolute_area(&polygon, &triangles) {
+                assert!((area - expected).abs() < 1e-6 * expected, "expected {expected}, got {area}");
+            }
+            let fan: Vec<_> = (2..polygon.len()).map(|index| [0, index - 1, index]).collect();
+            let [_, absolute_area] = signed_and_absolute_area(&polygon, &fan);
+            assert!(absolute_area > 1.01 * expected, "control: expected a fan above {expected}, got {absolute_area}");
+        }
+    }
+
+    /// The corners where an outline runs to a hole and back have one position, but can have different texture coordinates.
+    #[test]
+    fn corners_with_one_position_keep_their_sides() {
+        let hole = [[1.0, 1.0], [1.0, 2.0], [2.0, 2.0], [2.0, 1.0], [1.0, 1.0]];
+        let outline = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0], [0.0, 0.0]];
+        let polygon: Vec<_> = outline.iter().chain(&hole).map(|[x, y]| [*x, *y, 0.0]).collect();
+        let triangles = triangulate(&polygon).triangles;
+        let has_edge = |a: usize, b: usize| {
+            triangles.iter().any(|triangle| (0..3).any(|side| [triangle[side], triangle[(side + 1) % 3]] == [a, b]))
+        };
+        for corner in 0..polygon.len() {
+            let next = (corner + 1) % polygon.len();
+            assert!(has_edge(corner, next), "expected a triangle at the edge from {corner} to {next}: {triangles:?}");
+        }
+        assert_eq!(signed_and_absolute_area(&polygon, &triangles), [15.0; 2]);
+    }
+
+    /// Corners on straight edges are corners of triangles, because the polygon beside the edge has them too.
+    #[test]
+    fn corners_on_straight_edges_are_kept() {
+        let side = |start: [f32; 2], end: [f32; 2]| {
+            (0..100).map(move |step| {
+                let part = step as f32 / 100.0;
+                [start[0] + part * (end[0] - start[0]), start[1] + part * (end[1] - start[1]), 0.0]
+            })
+        };
+        let corners = [[0.0, 0.0], [3.0, 0.0], [3.0, 3.0], [1.5, 1.0], [0.0, 3.0]];
+        let polygon: Vec<_> = (0..5).flat_map(|index| side(corners[index], corners[(index + 1) % 5])).collect();
+        let triangles = triangulate(&polygon).triangles;
+        let unused = (0..polygon.len()).find(|corner| !triangles.as_flattened().contains(corner));
+        assert_eq!(unused, None);
+    }
+
+    #[test]
+    fn few_self_intersections_are_resolved_and_many_are_a_fan() {
+        let mut flag: Vec<_> = (0..1000).map(|index| [index as f32, (index % 2) as f32, 0.0]).collect();
+        flag.extend([[1000.0, 500.0, 0.0], [-1.0, 500.0, 0.0]]);
+        let area = signed_and_absolute_area(&flag, &triangulate(&flag).triangles)[1];
+        // Two teeth cross.
+        (flag[500][0], flag[501][0]) = (flag[501][0], flag[500][0]);
+        let Triangulation { triangles, is_inexact } = triangulate(&flag);
+        let crossed_area = signed_and_absolute_area(&flag, &triangles)[1];
+        assert!(!is_inexact && (crossed_area - area).abs() < 5.0, "expected about {area}, got {crossed_area}");
+        let random = |index: u64| (index.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 40) as f32;
+        let tangle: Vec<_> = (0..100_000).map(|index| [random(index), random(index * index + 7), 0.0]).collect();
+        let Triangulation { triangles, is_inexact } = triangulate(&tangle);
+        assert_eq!((triangles.len(), is_inexact), (tangle.len() - 2, true));
+    }
+
+    #[test]
+    fn degenerate_polygons_have_two_fewer_triangles() {
         for polygon in [
             vec![[1.0; 3]; 4],
             vec![[1.0; 3]; 7],
             vec![[0.0, 0.0, 0.0], [1e-40, 0.0, 0.0], [0.0, 1e38, 0.0], [0.0; 3], [1.0; 3]],
         ] {
-            assert_eq!(triangulate(&polygon).len(), polygon.len() - 2);
+            assert_eq!(triangulate(&polygon).triangles.len(), polygon.len() - 2);
         }
-        let wave: Vec<_> = (0..5000).map(|index| [index as f32, (index % 7) as f32, 0.0]).collect();
-        assert_eq!(triangulate(&wave).len(), 4998);
     }
 }
