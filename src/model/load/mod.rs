@@ -16,6 +16,7 @@
 //!   these defaults.
 //! - Normals of a file are kept. Missing normals are smooth except along creases, which split the corners of a vertex
 //!   but not the vertex itself (module `domain::creases`).
+//! - Values out of range: module `values` has the table that all formats share.
 //! - A file that does not exist although another file refers to it, and an image that is neither PNG nor JPEG, are
 //!   replaced by a default with a remark. In strict mode, they are errors.
 
@@ -37,7 +38,9 @@ mod repository;
 mod source;
 mod stl;
 mod surface;
+mod text;
 mod texture_cache;
+mod values;
 mod vega_config;
 
 pub use file_hashes::FileHashes;

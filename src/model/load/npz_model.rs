@@ -1,6 +1,6 @@
 //! Loader of NumPy archives with a mesh: the arrays `vertices` (n x 3) and `faces` (m x 3 or m x 4), and optionally
 //! `U`, `eigenvalues`, `normals` (n x 3), `corner_normals` (m x 3 x 3 or m x 4 x 3), `uvs` (n x 2, with (0, 0) at the top
-//! left), `colors` (n x 3 or n x 4, sRGB, 0 to 1, or 0 to 255 if any value is above 1), `face_materials` (m) with
+//! left), `colors` (n x 3 or n x 4, sRGB, 0 to 1 or 0 to 255), `face_materials` (m) with
 //! `material_colors` (k x 3 or k x 4, sRGB, 0 to 1, with alpha), and `notes` (a JSON object of texts, as bytes).
 
 use std::collections::{BTreeMap, HashMap};
@@ -12,6 +12,7 @@ use super::modes::{
 };
 use super::polygons::{self, Corner, NO_INDEX, PolygonMesh, build_bytes, linear_from_srgb};
 use super::surface::{self, ModelOptions};
+use super::values::Corrections;
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 use crate::scene::{SceneParts, UpAxis};
@@ -93,12 +94,13 @@ fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<Pa
         None if has_normals => FaceNormals::OfVertices,
         None => FaceNormals::Missing,
     };
-    let (materials, face_materials) = read_materials(&mut archive)?;
+    let (materials, face_materials) = read_materials(&mut archive, &mut polygons.corrections)?;
     polygons.materials = materials.iter().map(|material| material.name.clone()).collect();
     let faces = read_entries(&mut archive, "faces")?.unwrap_or_default().1;
     add_faces(&mut polygons, sizes.sides, &faces, &normals, &face_materials)?;
     drop((faces, normals, face_materials));
-    polygons.check(|face| format!("array 'faces': row {face}"), 0)?;
+    polygons.validate(|face| format!("array 'faces': row {face}"), 0)?;
+    remarks.extend(polygons.corrections.remarks(files.is_strict())?);
     let modes = sizes.modes.as_ref().map(|name| read_npz_modes(&mut archive, name)).transpose()?;
     let notes = read_npz_notes(&mut archive)?;
     let unused: Vec<&str> =
@@ -261,7 +263,7 @@ fn read_corner_normals(archive: &mut NpzArchive<'_>) -> Result<Option<CornerNorm
 }
 
 /// Reads the materials, and the index of the material of each face. Without materials, there is one, and no indices.
-fn read_materials(archive: &mut NpzArchive<'_>) -> Result<(Vec<Material>, Vec<usize>)> {
+fn read_materials(archive: &mut NpzArchive<'_>, corrections: &mut Corrections) -> Result<(Vec<Material>, Vec<usize>)> {
     let (colors, indices) = (read_entries(archive, "material_colors")?, read_entries(archive, "face_materials")?);
     let (width, colors, indices) = match (colors, indices) {
         (None, None) => return Ok((vec![Material::unspecified("")], Vec::new())),
@@ -272,9 +274,11 @@ fn read_materials(archive: &mut NpzArchive<'_>) -> Result<(Vec<Material>, Vec<us
         }
     };
     let material_count = colors.len() / width;
-    if let Some(entry) = colors.iter().find(|entry| !(0.0..=1.0).contains(*entry)) {
-        return Err(invalid("array 'material_colors'", "0 to 1", entry));
-    }
+    let mut correct = |channel: f64| {
+        let channel = corrections.in_range("array 'material_colors'", channel as f32, [0.0, 1.0], "1 is used");
+        channel.map_or(1.0, f64::from)
+    };
+    let colors: Vec<f64> = colors.into_iter().map(&mut correct).collect();
     let is_material = |index: &f64| index.fract() == 0.0 && (0.0..material_count as f64).contains(index);
     if let Some(row) = indices.iter().position(|index| !is_material(index)) {
         let expected = format!("0 to {}", material_count - 1);
@@ -304,32 +308,16 @@ fn read_entries(archive: &mut NpzArchive<'_>, name: &str) -> Result<Option<(Vec<
     parse_f64(&bytes).map(Some).map_err(|error| error.prefix_field(&format!("array '{name}'")))
 }
 
-/// Reads a declared array of finite vectors. Empty if the archive has no such array.
+/// Reads a declared array of vectors. Empty if the archive has no such array.
 fn read_vectors<const N: usize>(archive: &mut NpzArchive<'_>, name: &str) -> Result<Vec<[f32; N]>> {
     let Some((_, entries)) = read_entries(archive, name)? else { return Ok(Vec::new()) };
-    finite_vectors(name, &entries)
+    Ok(entries.as_chunks::<N>().0.iter().map(|row| row.map(|entry| entry as f32)).collect())
 }
 
-/// Converts the entries of the array `name` to vectors.
-fn finite_vectors<const N: usize>(name: &str, entries: &[f64]) -> Result<Vec<[f32; N]>> {
-    let vectors: Vec<[f32; N]> = entries.as_chunks::<N>().0.iter().map(|row| row.map(|entry| entry as f32)).collect();
-    match vectors.iter().position(|vector| vector.iter().any(|number| !number.is_finite())) {
-        None => Ok(vectors),
-        Some(row) => {
-            Err(invalid(format!("array '{name}': row {row}"), "finite numbers", format!("{:?}", vectors[row])))
-        }
-    }
-}
-
-/// Reads the colors. Divides them by 255 if any value is above 1. The fourth channel is not used.
+/// Reads the colors. The fourth channel is not used.
 fn read_colors(archive: &mut NpzArchive<'_>) -> Result<Vec<[f32; 3]>> {
     let Some((shape, entries)) = read_entries(archive, "colors")? else { return Ok(Vec::new()) };
-    let largest = entries.iter().copied().fold(0.0, f64::max);
-    if let Some(entry) = entries.iter().find(|entry| !(0.0..=255.0).contains(*entry)) {
-        return Err(invalid("array 'colors'", "0 to 1, or 0 to 255", entry));
-    }
-    let scale = if largest > 1.0 { 255.0 } else { 1.0 };
-    Ok(entries.chunks_exact(shape[1]).map(|row| [0, 1, 2].map(|channel| (row[channel] / scale) as f32)).collect())
+    Ok(entries.chunks_exact(shape[1]).map(|row| [0, 1, 2].map(|channel| row[channel] as f32)).collect())
 }
 
 #[cfg(test)]
@@ -420,7 +408,8 @@ mod tests {
         assert_eq!(parts.domains[0].metadata.eigenvalues, [1.0, 4.0]);
         assert_eq!(parts.domains[0].metadata.notes["modes.file"], "a.npz");
         assert_eq!((parts.up, parts.textures.len()), (UpAxis::Z, 1));
-        assert_eq!(parts.remarks, ["arrays that are not used: stress"]);
+        let divided = "colors of vertices are divided by 255, because they exceed 1";
+        assert_eq!(parts.remarks, [divided, "arrays that are not used: stress"]);
         crate::scene::Scene::new(parts).expect("a valid scene");
         let quads = vec![square().remove(0), ("faces", npy(&arr2(&[[0_i32, 1, 2, 3]])))];
         assert_eq!(read_arrays(&quads).expect("a quadrilateral").shapes[0].mesh.triangles().len(), 2);
@@ -487,14 +476,11 @@ mod tests {
             (faces(&[]), "array 'faces': shape: expected n x 3 or 4, got [0, 3]"),
             (square()[..1].to_vec(), "archive: expected the arrays vertices and faces"),
             (with("normals", npy(&arr2(&[[0.0, 0.0, 1.0]]))), "array 'normals': shape: expected 4 x 3, got [1, 3]"),
-            (with("colors", npy(&arr2(&[[-1.0; 3]; 4]))), "array 'colors': expected 0 to 1, or 0 to 255"),
             (with("corner_normals", npy(&arr1(&[0.0; 18]))), "array 'corner_normals': shape: expected 2 x 3 x 3"),
-            (with("corner_normals", npy(&corner_normals)), "array 'corner_normals': row 1: expected finite numbers"),
             (with("face_materials", npy(&arr1(&[0, 0]))), "archive: expected both arrays face_materials and"),
             (with_materials(&[0.0, 2.0], 1.0), "array 'face_materials': row 1: expected 0 to 1, got 2"),
             (with_materials(&[0.5, 0.0], 1.0), "array 'face_materials': row 0: expected 0 to 1, got 0.5"),
             (with_materials(&[0.0], 1.0), "array 'face_materials': shape: expected [2], got [1]"),
-            (with_materials(&[0.0, 0.0], 1.5), "array 'material_colors': expected 0 to 1, got 1.5"),
             (with("notes", npy(&arr1(b"{\"a\": 1}"))), "array 'notes': text: expected a JSON object of texts in"),
             (with("notes", npy(&arr1(b"\xff"))), "array 'notes': text: expected a JSON object of texts in"),
             (with("notes", npy(&arr1(&[1.0]))), "array 'notes': descr: expected u1, got <f8"),
@@ -515,8 +501,27 @@ mod tests {
             [with("normals", npy(&arr2(&[[0.0; 3]; 4]))), vec![("corner_normals", npy(&corner_normals))]].concat();
         assert!(read_arrays(&both).is_err(), "expected an error for two arrays of normals");
         let mut vertices = square();
-        vertices[0].1 = npy(&arr2(&[[0.0, f64::INFINITY, 0.0]]));
+        vertices[0].1 = npy(&arr2(&[[0.0, f64::INFINITY, 0.0], [1.0; 3], [2.0; 3], [3.0; 3]]));
         let message = read_arrays(&vertices).expect_err("an infinite coordinate").to_string();
-        assert!(message.contains("array 'vertices': row 0: expected finite numbers"), "{message}");
+        let expected = "array 'faces': row 0: position of vertex 0: expected finite numbers, got [0.0, inf, 0.0]";
+        assert!(message.contains(expected), "{message}");
+    }
+
+    #[test]
+    fn values_without_effect_are_remarks() {
+        let with = |name: &'static str, bytes: Vec<u8>| [square(), vec![(name, bytes)]].concat();
+        let mut corner_normals = ndarray::Array3::from_elem((2, 3, 3), 1.0);
+        corner_normals[[0, 1, 2]] = f64::NAN;
+        let materials = [("face_materials", npy(&arr1(&[0, 0]))), ("material_colors", npy(&arr2(&[[1.5, 0.0, 0.0]])))];
+        for (arrays, start) in [
+            (with("colors", npy(&arr2(&[[-1.0; 3]; 4]))), "color of a vertex: expected 0 to 1, got [-1.0, -1.0, -1.0]"),
+            (with("corner_normals", npy(&corner_normals)), "normal: expected finite numbers, got [1.0, 1.0, NaN]"),
+            (with("uvs", npy(&arr2(&[[f64::NAN; 2]; 4]))), "texture coordinates: expected finite numbers"),
+            ([square(), materials.to_vec()].concat(), "array 'material_colors': expected 0 to 1, got 1.5: 1 is used"),
+        ] {
+            let parts = read_arrays(&arrays).expect(start);
+            assert!(parts.remarks[0].starts_with(start), "expected {start}, got {:?}", parts.remarks);
+            crate::scene::Scene::new(parts).expect("a valid scene");
+        }
     }
 }

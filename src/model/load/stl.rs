@@ -13,6 +13,7 @@ use std::collections::HashMap;
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, PolygonMesh};
 use super::surface::{self, ModelOptions};
+use super::text::{lines, without_byte_order_mark};
 use crate::domain::Material;
 use crate::error::{Result, invalid};
 use crate::memory::TemporaryReservation;
@@ -20,6 +21,8 @@ use crate::scene::{SceneParts, UpAxis};
 
 /// Bytes of a binary header: a comment, then the number of triangles.
 const HEADER_BYTES: usize = 84;
+/// Bytes at the start of a text that have no byte 0.
+const TEXT_START_BYTES: usize = 1024;
 /// Bytes of a binary triangle: normal, three vertices, attribute.
 const TRIANGLE_BYTES: usize = 50;
 
@@ -45,8 +48,11 @@ fn parse(bytes: &[u8], memory: Option<TemporaryReservation>, remarks: &mut Vec<S
     });
     let mut merger = VertexMerger::default();
     merger.polygons.memory = memory;
-    // A binary file may also begin with `solid`. Its size is certain.
-    let is_text = bytes.trim_ascii_start().get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
+    // A binary file may also begin with `solid`. It has a byte 0: in the number of triangles, unless there are more than
+    // 16,777,215, or in a coordinate.
+    let text = without_byte_order_mark(bytes).unwrap_or(bytes);
+    let has_key = text.trim_ascii_start().get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid"));
+    let is_text = has_key && !bytes[..bytes.len().min(TEXT_START_BYTES)].contains(&0);
     match declared_bytes {
         Some(size) if size == bytes.len() || (size < bytes.len() && !is_text) => {
             if size < bytes.len() {
@@ -54,13 +60,13 @@ fn parse(bytes: &[u8], memory: Option<TemporaryReservation>, remarks: &mut Vec<S
             }
             parse_binary(&bytes[HEADER_BYTES..size], &mut merger)?;
         }
-        _ if is_text => parse_text(bytes, &mut merger)?,
+        _ if is_text => parse_text(text, &mut merger)?,
         Some(size) => return Err(invalid("size", format!("{size} bytes, as the header declares"), bytes.len())),
         None => return Err(invalid("header", "84 bytes, or a text that begins with solid", bytes.len())),
     }
     let mut polygons = merger.polygons;
     polygons.materials.push(String::new());
-    polygons.check(|triangle| format!("triangle {triangle}"), 0)?;
+    polygons.validate(|triangle| format!("triangle {triangle}"), 0)?;
     Ok(polygons)
 }
 
@@ -86,7 +92,7 @@ fn parse_binary(triangles: &[u8], merger: &mut VertexMerger) -> Result<()> {
 fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
     let mut vertices: Vec<[f32; 3]> = Vec::new();
     let mut is_in_loop = false;
-    for (index, line) in bytes.split(|byte| *byte == b'\n').enumerate() {
+    for (index, line) in lines(bytes).enumerate() {
         let location = format_args!("line {}", index + 1).to_string();
         let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let key = words.next().unwrap_or_default().to_ascii_lowercase();
@@ -175,14 +181,25 @@ mod tests {
         // A binary file may begin with the word that begins text files, and may have bytes after its triangles.
         let mut remarks = Vec::new();
         let padded = [binary("", 2, &SQUARE), vec![0; 3]].concat();
-        for bytes in [TEXT.as_bytes(), &binary("solid exported", 2, &SQUARE), &padded] {
+        let solid_padded = [binary("solid exported", 2, &SQUARE), vec![7; 3]].concat();
+        let marked = format!("\u{feff}{TEXT}");
+        let [cr_lf, cr] = ["\r\n", "\r"].map(|line_end| TEXT.replace('\n', line_end));
+        for bytes in [
+            TEXT.as_bytes(),
+            marked.as_bytes(),
+            cr_lf.as_bytes(),
+            cr.as_bytes(),
+            &binary("solid exported", 2, &SQUARE),
+            &padded,
+            &solid_padded,
+        ] {
             let polygons = parse(bytes, None, &mut remarks).expect("a valid file");
             assert_eq!(polygons.faces.len(), 2, "expected the triangles of both solids");
             assert_eq!(polygons.positions, [[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1.0, 0.0]]);
             let vertices: Vec<u32> = polygons.corners_of(1).iter().map(|corner| corner.vertex).collect();
             assert_eq!(vertices, [1, 3, 2]);
         }
-        assert_eq!(remarks, ["3 bytes after the last triangle are not used"]);
+        assert_eq!(remarks, ["3 bytes after the last triangle are not used"; 2]);
     }
 
     #[test]
@@ -191,6 +208,7 @@ mod tests {
         nan[1][2][1] = f32::NAN;
         for (bytes, message) in [
             (binary("", u32::MAX, &SQUARE), "size: expected 214748364834 bytes, as the header declares, got 184"),
+            (binary("solid", 3, &SQUARE), "size: expected 234 bytes, as the header declares, got 184"),
             (binary("", 3, &SQUARE), "size: expected 234 bytes, as the header declares, got 184"),
             (binary("", 2, &nan), "triangle 1: vertex: expected finite numbers, got NaN"),
             (binary("", 0, &[]), "faces: expected at least one face, got 0"),

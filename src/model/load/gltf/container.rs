@@ -5,6 +5,7 @@ use serde_json::Value;
 
 use super::document::Document;
 use crate::error::{Result, invalid};
+use crate::load::text::without_byte_order_mark;
 
 /// The largest number of JSON objects in a document. Each object takes at least two bytes of text but about 300 bytes
 /// of memory.
@@ -34,7 +35,7 @@ pub(super) struct Container<'a> {
 /// `Invalid` with the field of the header or the chunk.
 pub(super) fn split_container(content: &[u8]) -> Result<Container<'_>> {
     if !content.starts_with(MAGIC) {
-        return Ok(Container { json: content, bin: None });
+        return Ok(Container { json: without_byte_order_mark(content)?, bin: None });
     }
     let version = read_word(content, 4, "glb.version")?;
     if version != 2 {

@@ -6,6 +6,8 @@ use crate::error::Result;
 use crate::load::asset_dir::AssetDir;
 use crate::load::texture_cache::TextureCache;
 
+/// The largest exponent of a highlight.
+const MAX_EXPONENT: f32 = 1e6;
 /// The alpha-test cutoff of materials whose alpha comes from an image.
 pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 
@@ -15,8 +17,8 @@ pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 /// MTL cannot express this property and leaves are usually single sheets.
 ///
 /// # Errors
-/// `Invalid` with the material and the statement: an unreadable file or a number out of range. In strict mode, also a
-/// missing image, an image that is neither PNG nor JPEG, and a color above 1, which are remarks otherwise.
+/// `Invalid` with the material and the statement: an unreadable file. In strict mode, also a missing image, an image that is
+/// neither PNG nor JPEG, and the corrections of [`crate::load::values`], which are remarks otherwise.
 pub(super) fn create_material(
     name: &str,
     statements: &MtlMaterial,
@@ -25,7 +27,19 @@ pub(super) fn create_material(
     remarks: &mut Vec<String>,
 ) -> Result<Material> {
     let field_of = |statement: &str| format!("material '{name}': {statement}");
-    let diffuse = statements.diffuse.unwrap_or([1.0; 3]);
+    let mut corrections = statements.corrections.clone();
+    let mut color = |statement: &str, color: Option<[f32; 3]>| {
+        corrections.color(&field_of(statement), color?, "the default is used")
+    };
+    let diffuse = color("Kd", statements.diffuse).unwrap_or([1.0; 3]);
+    let ambient = color("Ka", statements.ambient).unwrap_or(diffuse);
+    let specular = color("Ks", statements.specular).unwrap_or([0.0; 3]);
+    let mut number = |statement: &str, value: Option<f32>, range: [f32; 2]| {
+        corrections.in_range(&field_of(statement), value?, range, "the default is used")
+    };
+    let alpha = number("d", statements.opacity, [0.0, 1.0]).unwrap_or(1.0);
+    let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).unwrap_or(1.0);
+    remarks.extend(corrections.remarks(files.is_strict())?);
     let statements = &without_unusable_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
         .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
@@ -38,7 +52,6 @@ pub(super) fn create_material(
     if let (Some(path), None) = (&statements.normal_map, normal_texture) {
         remarks.push(field_of(&format!("'{path}' is a gray height map and is not used: expected a normal map")));
     }
-    let alpha = statements.opacity.unwrap_or(1.0);
     let has_alpha = color_texture.is_some_and(|index| texture_cache.textures()[index].has_alpha());
     let alpha_mode = if alpha < 1.0 {
         AlphaMode::Blend
@@ -47,20 +60,13 @@ pub(super) fn create_material(
     } else {
         AlphaMode::Opaque
     };
-    // Some programs write light intensities into the colors.
-    let is_out_of_range = |color: Option<[f32; 3]>| color.is_some_and(|color| color.iter().any(|value| *value > 1.0));
-    let limits_colors = !files.is_strict();
-    if limits_colors && [statements.ambient, statements.diffuse, statements.specular].into_iter().any(is_out_of_range) {
-        remarks.push(format!("material '{name}': channels above 1 in Ka, Kd or Ks are drawn as 1"));
-    }
-    let limited = |color: [f32; 3]| if limits_colors { color.map(|channel| channel.min(1.0)) } else { color };
     let material = Material {
         name: name.to_owned(),
-        ambient: limited(statements.ambient.unwrap_or(diffuse)),
-        diffuse: limited(diffuse),
-        specular: limited(statements.specular.unwrap_or([0.0; 3])),
+        ambient,
+        diffuse,
+        specular,
         // An exponent near 0 would spread the highlight over the whole lit side. Files use 0 for "not specified".
-        shininess: statements.exponent.unwrap_or(1.0).clamp(1.0, 1e6),
+        shininess: exponent.max(1.0),
         alpha,
         color_texture,
         normal_texture,
@@ -219,15 +225,27 @@ mod tests {
         assert!(remarks[0].contains("'h.png' is a gray height map"), "{remarks:?}");
     }
 
+    /// Light intensities, roundings, and values that are not numbers.
     #[test]
-    fn channels_above_1_are_limited_with_a_remark() {
-        let statements = super::super::mtl::parse(b"newmtl m\nKd 1.5 0.5 0\nKs 2 0 0\n").expect("an MTL library");
+    fn numbers_out_of_range_are_remarks_with_the_used_value() {
+        let text = "newmtl m\nKd 1.5 -0.0001 0.0\nKs 2 1.0000001 nan\nTr -0.00001\nNs 1e9\nKa 1 1 1 1\n";
+        let statements = super::super::mtl::parse(text.as_bytes()).expect("an MTL library");
         let (mut texture_cache, mut remarks) = (TextureCache::default(), Vec::new());
         let files = AssetDir::unrestricted(&std::env::temp_dir());
         let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks);
         let material = material.expect("a material");
-        assert_eq!((material.diffuse, material.specular), ([1.0, 0.5, 0.0], [1.0, 0.0, 0.0]));
-        assert_eq!(remarks, ["material 'm': channels above 1 in Ka, Kd or Ks are drawn as 1"]);
+        assert_eq!((material.diffuse, material.specular), ([1.0, 0.0, 0.0], [0.0; 3]));
+        assert_eq!((material.alpha, material.alpha_mode, material.shininess), (1.0, AlphaMode::Opaque, 1e6));
+        let expected = [
+            "Ka: expected one or three numbers, got 1 1 1 1: three are used",
+            "Kd: expected 0 to 1, got 1.5: 1 is used",
+            "Kd: expected 0 to 1, got -0.0001: 0 is used",
+            "Ks: expected 0 to 1, got 2: 1 is used",
+            "Ks: expected 0 to 1, got NaN: the default is used",
+            "d: expected 0 to 1, got 1.00001: 1 is used",
+            "Ns: expected 0 to 1000000, got 1000000000: 1000000 is used",
+        ];
+        assert_eq!(remarks, expected.map(|remark| format!("material 'm': {remark}")));
     }
 
     #[test]
@@ -261,8 +279,9 @@ mod tests {
             ("map_Kd no.png", "material 'm': map_Kd: file 'no.png': expected an existing file, got none (strict mode)"),
             ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),
             ("norm no.png", "material 'm': normal map: file 'no.png': expected an existing file"),
-            ("d 7", "material 'm': alpha: expected 0 to 1, got 7"),
-            ("Ka 0 0 0\nKd 1 1 2", "material 'm': diffuse: expected 0 to 1, got 2"),
+            ("d 7", "material 'm': d: expected 0 to 1, got 7 (strict mode)"),
+            ("Ns nan", "material 'm': Ns: expected 0 to 1000000, got NaN (strict mode)"),
+            ("Ka 0 0 0\nKd 1 1 2", "material 'm': Kd: expected 0 to 1, got 2 (strict mode)"),
         ] {
             let message = read(&format!("newmtl m\n{statement}\n"), folder.path()).expect_err(statement).to_string();
             assert!(message.starts_with(start), "{message}");

@@ -40,7 +40,10 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
 pub(super) fn parse_file(files: &AssetDir, name: &str) -> Result<ObjFile> {
     let content = files.read(name, MAX_MODEL_BYTES)?;
     let memory = files.reserve_polygons(name, content.len())?;
-    ObjFile::parse(&content, memory).map_err(|error| error.prefix_field(&format!("file '{name}'")))
+    let in_file = |error: crate::error::Error| error.prefix_field(&format!("file '{name}'"));
+    let mut obj = ObjFile::parse(&content, memory).map_err(in_file)?;
+    obj.remarks.extend(obj.polygons.corrections.remarks(files.is_strict()).map_err(in_file)?);
+    Ok(obj)
 }
 
 /// Parses the text of a test, without materials.

@@ -4,8 +4,10 @@
 
 use std::collections::BTreeMap;
 
-use super::parse::{parse_number, text_after_key, without_byte_order_mark, words};
-use crate::error::{Result, invalid};
+use super::parse::{parse_number, text_after_key, words};
+use crate::error::{Error, Result, invalid};
+use crate::load::text::{lines, without_byte_order_mark};
+use crate::load::values::{CorrectedValue, Corrections};
 
 /// The statements of one `newmtl`. A missing statement is `None`.
 #[derive(Debug, Default, Clone, PartialEq)]
@@ -22,22 +24,26 @@ pub(super) struct MtlMaterial {
     pub(super) normal_map: Option<String>,
     /// Messages about statements that are not supported.
     pub(super) remarks: Vec<String>,
+    /// Statements that are not understood.
+    pub(super) corrections: Corrections,
 }
 
-/// Parses a file. If a name is defined several times, the last definition is used.
+/// Parses a file. If a name is defined several times, the last definition is used. A statement that is not understood is
+/// ignored and added to the corrections of the material.
 ///
 /// # Errors
-/// `Invalid` with the line and the statement.
+/// `Invalid` if the text is UTF-16.
 pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
     let mut materials = BTreeMap::new();
     let mut current: Option<(String, MtlMaterial)> = None;
-    for (index, line) in without_byte_order_mark(bytes)?.split(|byte| *byte == b'\n').enumerate() {
+    for (index, line) in lines(without_byte_order_mark(bytes)?).enumerate() {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
             materials.extend(current.replace((text_after_key(line), MtlMaterial::default())));
         } else if let Some((name, statements)) = &mut current {
-            let location = || format!("line {}: {}", index + 1, String::from_utf8_lossy(key));
-            statements.parse_statement(key, line, name).map_err(|error| error.prefix_field(&location()))?;
+            if let Err(error) = statements.parse_statement(key, line, name) {
+                statements.ignore_statement(key, index + 1, name, error)?;
+            }
         }
     }
     materials.extend(current);
@@ -45,11 +51,19 @@ pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
 }
 
 impl MtlMaterial {
+    fn ignore_statement(&mut self, key: &[u8], line: usize, material_name: &str, error: Error) -> Result<()> {
+        let Error::Invalid { field, expected, given } = error else { return Err(error) };
+        let subject = format!("material '{material_name}': {}: {field}", String::from_utf8_lossy(key));
+        let value = || CorrectedValue::new(format!("line {line}"), expected, given);
+        self.corrections.add(&subject, "the statement is ignored", value);
+        Ok(())
+    }
+
     fn parse_statement(&mut self, key: &[u8], line: &[u8], material_name: &str) -> Result<()> {
         match key.to_ascii_lowercase().as_slice() {
-            b"ka" => self.ambient = Some(parse_color(line)?),
-            b"kd" => self.diffuse = Some(parse_color(line)?),
-            b"ks" => self.specular = Some(parse_color(line)?),
+            b"ka" => self.ambient = Some(self.parse_color(line, material_name)?),
+            b"kd" => self.diffuse = Some(self.parse_color(line, material_name)?),
+            b"ks" => self.specular = Some(self.parse_color(line, material_name)?),
             b"ns" => self.exponent = Some(parse_last_number(line)?),
             b"d" => self.opacity = Some(parse_last_number(line)?),
             b"tr" => self.set_transparency(parse_last_number(line)?, material_name),
@@ -61,6 +75,25 @@ impl MtlMaterial {
             _ => {}
         }
         Ok(())
+    }
+
+    /// Parses one number per channel, or one number for all channels. Numbers after the channels, such as an alpha, are not
+    /// used.
+    fn parse_color(&mut self, line: &[u8], material_name: &str) -> Result<[f32; 3]> {
+        let numbers: Option<Vec<f32>> = words(line).skip(1).map(parse_number).collect();
+        let color_error = || invalid("color", "one or three numbers", text_after_key(line));
+        match numbers.as_deref() {
+            Some([gray]) => Ok([*gray; 3]),
+            Some([red, green, blue, unused @ ..]) => {
+                if !unused.is_empty() {
+                    let key = String::from_utf8_lossy(words(line).next().unwrap_or_default());
+                    let value = || CorrectedValue::new("", "one or three numbers", text_after_key(line));
+                    self.corrections.add(&format!("material '{material_name}': {key}"), "three are used", value);
+                }
+                Ok([*red, *green, *blue])
+            }
+            _ => Err(color_error()),
+        }
     }
 
     /// Sets the opacity to 1 - `Tr`, but ignores `Tr 1`: VTK writes the opacity as `Tr`, so its opaque surfaces would
@@ -81,8 +114,10 @@ impl MtlMaterial {
             let max_arguments = match option {
                 "s" | "o" | "t" => 3,
                 "mm" => 2,
-                "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type" => 1,
-                _ => return Err(invalid("option", "an image option of MTL", format!("-{option}"))),
+                "blendu" | "blendv" | "cc" | "clamp" | "bm" | "boost" | "imfchan" | "texres" | "type"
+                | "colorspace" => 1,
+                // The last word is the path.
+                _ => usize::from(text_after_option.contains(' ')),
             };
             let remark = format!("material '{material_name}': image option '-{option}' is not used");
             if !self.remarks.contains(&remark) {
@@ -111,20 +146,10 @@ fn split_first_word(text: &str) -> (&str, &str) {
         .map_or((text, ""), |(word, remainder)| (word, remainder.trim_start()))
 }
 
-/// Parses one number per channel, or one number for all channels.
-fn parse_color(line: &[u8]) -> Result<[f32; 3]> {
-    let numbers: Option<Vec<f32>> = words(line).skip(1).map(parse_number).collect();
-    match numbers.as_deref() {
-        Some([gray]) => Ok([*gray; 3]),
-        Some([red, green, blue]) => Ok([*red, *green, *blue]),
-        _ => Err(invalid("color", "one or three finite numbers", text_after_key(line))),
-    }
-}
-
 /// Parses the last word as a number, because options may precede it as in `d -halo 0.5`.
 fn parse_last_number(line: &[u8]) -> Result<f32> {
     let value = words(line).skip(1).last().and_then(parse_number);
-    value.ok_or_else(|| invalid("value", "a finite number", text_after_key(line)))
+    value.ok_or_else(|| invalid("value", "a number", text_after_key(line)))
 }
 
 #[cfg(test)]
@@ -155,18 +180,31 @@ mod tests {
     }
 
     #[test]
-    fn invalid_statements_are_rejected_with_their_line() {
-        for (statement, message) in [
-            ("Kd 1 2", "line 2: Kd: color: expected one or three finite numbers, got 1 2"),
-            ("Kd spectral a.rfl", "line 2: Kd: color: expected one or three finite numbers, got spectral a.rfl"),
-            ("Ns", "line 2: Ns: value: expected a finite number, got "),
-            ("d inf", "line 2: d: value: expected a finite number, got inf"),
-            ("map_Kd", "line 2: map_Kd: path: expected the name of an image file, got none"),
-            ("map_Kd -clamp on", "line 2: map_Kd: path: expected the name of an image file, got none"),
-            ("map_Kd -zoom a.png", "line 2: map_Kd: option: expected an image option of MTL, got -zoom"),
+    fn statements_that_are_not_understood_are_ignored_with_a_remark() {
+        for (statement, remark) in [
+            ("Kd 1 2", "Kd: color: expected one or three numbers, got 1 2 (line 2): the statement is ignored"),
+            ("Kd 0.5 0 0 1", "Kd: expected one or three numbers, got 0.5 0 0 1: three are used"),
+            (
+                "Kd spectral a.rfl",
+                "Kd: color: expected one or three numbers, got spectral a.rfl (line 2): the statement is ignored",
+            ),
+            ("Ns", "Ns: value: expected a number, got  (line 2): the statement is ignored"),
+            ("map_Kd", "map_Kd: path: expected the name of an image file, got none (line 2): the statement is ignored"),
+            (
+                "map_Kd -clamp on",
+                "map_Kd: path: expected the name of an image file, got none (line 2): the statement is ignored",
+            ),
         ] {
+            let text = format!("newmtl a\r\n{statement}\r\n");
+            let corrections = &parse(text.as_bytes()).expect(statement)["a"].corrections;
+            assert_eq!(corrections.remarks(false), Ok(vec![format!("material 'a': {remark}")]));
+            assert!(corrections.remarks(true).is_err(), "{statement}: expected an error in strict mode");
+        }
+        for statement in ["map_Kd -zoom a b.png", "map_Kd -colorspace sRGB a b.png", "map_Kd -zoom 2 a b.png"] {
             let text = format!("newmtl a\n{statement}\n");
-            assert_eq!(parse(text.as_bytes()).expect_err(statement).to_string(), message);
+            let material = &parse(text.as_bytes()).expect(statement)["a"];
+            let path = if statement.contains("-zoom a") { "b.png" } else { "a b.png" };
+            assert_eq!((material.color_map.as_deref(), material.remarks.len()), (Some(path), 1));
         }
         assert!(parse(b"\xff\nnewmtl \xff\nmap_Kd \xff").is_ok());
     }

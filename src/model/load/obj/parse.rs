@@ -7,13 +7,12 @@ use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
 use crate::load::polygons::{Corner, NO_INDEX, PolygonMesh};
+use crate::load::text::{lines, without_byte_order_mark};
+use crate::load::values::{CorrectedValue, MISSING_COLOR};
 use crate::memory::TemporaryReservation;
 
 /// The largest number of remarks on unsupported statements, one per key.
 const MAX_REMARKS: usize = 16;
-
-/// Marks a vertex without a color in a file that has colors. Such a vertex is white.
-const NO_COLOR: [f32; 3] = [-1.0; 3];
 
 /// The contents of an OBJ file.
 #[derive(Debug, Default)]
@@ -35,10 +34,9 @@ impl ObjFile {
         let mut parser = Parser::default();
         parser.obj.polygons.memory = memory;
         let mut joined_line = Vec::new();
-        for (index, line) in without_byte_order_mark(bytes)?.split(|byte| *byte == b'\n').enumerate() {
-            let line = line.strip_suffix(b"\r").unwrap_or(line);
-            // A backslash at the end of a line continues it on the next one.
-            if let Some(line_start) = line.strip_suffix(b"\\") {
+        for (index, line) in lines(without_byte_order_mark(bytes)?).enumerate() {
+            // A backslash at the end of a line continues it on the next one, unless it ends a comment such as a path.
+            if let Some(line_start) = line.strip_suffix(b"\\").filter(|line| !has_comment(line)) {
                 joined_line.extend_from_slice(line_start);
                 joined_line.push(b' ');
                 continue;
@@ -55,18 +53,6 @@ impl ObjFile {
     }
 }
 
-/// A text without the byte-order mark that some programs write at its start.
-///
-/// # Errors
-/// `Invalid` for the mark of UTF-16.
-pub(super) fn without_byte_order_mark(text: &[u8]) -> Result<&[u8]> {
-    match text {
-        [0xef, 0xbb, 0xbf, rest @ ..] => Ok(rest),
-        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Err(invalid("text", "UTF-8", "UTF-16")),
-        _ => Ok(text),
-    }
-}
-
 #[derive(Default)]
 struct Parser {
     obj: ObjFile,
@@ -78,8 +64,8 @@ struct Parser {
     material_indices: HashMap<String, usize>,
     /// The corners of the current face. The allocation is reused.
     corners: Vec<Corner>,
-    /// The largest channel of all colors of vertices.
-    max_color: f32,
+    /// The index and the last number of each vertex with seven numbers.
+    seventh_numbers: Vec<(usize, f32)>,
     /// Number of statements per unsupported key.
     unsupported_counts: BTreeMap<String, usize>,
 }
@@ -124,13 +110,26 @@ impl Parser {
         corners.clear();
         for word in words {
             let mut fields = word.split(|byte| *byte == b'/');
+            let polygons = &mut self.obj.polygons;
+            let corrections = &mut polygons.corrections;
             let mut parse_index = |list: &str, count: usize| match fields.next() {
                 None | Some(b"") => Ok(NO_INDEX),
                 Some(digits) => {
-                    resolve_index(digits, count).map_err(|error| error.prefix_field(&format!("line {line}: f: {list}")))
+                    let field = || format!("line {line}: f: {list}: index");
+                    let given = String::from_utf8_lossy(digits);
+                    let index = given.parse().map_err(|_| invalid(field(), "a whole number", &given))?;
+                    let expected = || format!("1 to {count} or -{count} to -1");
+                    match resolve_index(index, count) {
+                        Some(index) => Ok(index),
+                        None if list == "v" => Err(invalid(field(), expected(), given)),
+                        None => {
+                            let place = || CorrectedValue::new(format!("line {line}: f"), expected(), given);
+                            corrections.add(&format!("index of {list}"), "the index is ignored", place);
+                            Ok(NO_INDEX)
+                        }
+                    }
                 }
             };
-            let polygons = &self.obj.polygons;
             let vertex = parse_index("v", polygons.positions.len())?;
             let uv = parse_index("vt", polygons.uvs.len())?;
             let normal = parse_index("vn", polygons.normals.len())?;
@@ -139,9 +138,6 @@ impl Parser {
                 return Err(invalid(format!("line {line}: f"), "corners of the form v, v/vt, v//vn or v/vt/vn", given));
             }
             corners.push(Corner { vertex, uv, normal });
-        }
-        if corners.len() < 3 {
-            return Err(invalid(format!("line {line}: f"), "at least 3 corners", corners.len()));
         }
         let material = self.current_material_index();
         self.obj.polygons.add_face(corners.iter().copied(), material, line)?;
@@ -154,33 +150,50 @@ impl Parser {
         let position = parse_vector(words.by_ref(), "v", line)?;
         let polygons = &mut self.obj.polygons;
         polygons.positions.push(position);
-        let color_words: Vec<&[u8]> = words.take(3).collect();
+        let color_words: Vec<&[u8]> = words.take(4).collect();
         // A single number is the weight of a rational curve.
-        if let [_, _, _] = color_words[..] {
-            let color = parse_vector(color_words.into_iter(), "v: color", line)?;
-            if color.iter().any(|channel| !(0.0..=255.0).contains(channel)) {
-                return Err(invalid(format!("line {line}: v: color"), "0 to 1, or 0 to 255", format!("{color:?}")));
-            }
-            self.max_color = color.into_iter().fold(self.max_color, f32::max);
-            polygons.colors.resize(polygons.positions.len() - 1, NO_COLOR);
+        if color_words.len() >= 3 {
+            let vertex = polygons.positions.len() - 1;
+            let color = parse_vector(color_words[..3].iter().copied(), "v: color", line)?;
+            polygons.colors.resize(vertex, MISSING_COLOR);
             polygons.colors.push(color);
+            if let Some(word) = color_words.get(3) {
+                let number = parse_number(word);
+                let error = || number_error("v", "seven numbers", Some(*word), line);
+                self.seventh_numbers.push((vertex, number.ok_or_else(error)?));
+            }
         }
         Ok(())
     }
 
-    fn finish(mut self) -> Result<ObjFile> {
-        let polygons = &mut self.obj.polygons;
-        polygons.check(|line| format!("line {line}: f"), 1)?;
-        if !polygons.colors.is_empty() {
-            let scale = if self.max_color > 1.0 { 255.0 } else { 1.0 };
-            if scale > 1.0 {
-                self.obj.remarks.push("colors of vertices are divided by 255, because some exceed 1".into());
-            }
-            polygons.colors.resize(polygons.positions.len(), NO_COLOR);
-            for color in &mut polygons.colors {
-                *color = if *color == NO_COLOR { [1.0; 3] } else { color.map(|channel| channel / scale) };
-            }
+    /// Interprets seven numbers of a vertex as x y z w r g b if w is 1 everywhere, and otherwise as x y z r g b a.
+    fn resolve_seventh_numbers(&mut self) {
+        let Self { obj: ObjFile { polygons, .. }, seventh_numbers, .. } = self;
+        if seventh_numbers.is_empty() {
+            return;
         }
+        let count = seventh_numbers.len();
+        if seventh_numbers.iter().all(|(vertex, _)| polygons.colors[*vertex][0] == 1.0) {
+            for (vertex, blue) in seventh_numbers {
+                let [_, red, green] = polygons.colors[*vertex];
+                polygons.colors[*vertex] = [red, green, *blue];
+            }
+            polygons
+                .corrections
+                .add_note(format!("{count} vertices have seven numbers, read as x y z w r g b: w is 1"));
+        } else {
+            let note = "read as x y z r g b a, because the fourth is not always 1: a is not used";
+            polygons.corrections.add_note(format!("{count} vertices have seven numbers, {note}"));
+        }
+    }
+
+    fn finish(mut self) -> Result<ObjFile> {
+        self.resolve_seventh_numbers();
+        let polygons = &mut self.obj.polygons;
+        if !polygons.colors.is_empty() {
+            polygons.colors.resize(polygons.positions.len(), MISSING_COLOR);
+        }
+        polygons.validate(|line| format!("line {line}: f"), 1)?;
         let remark = |(key, count): (&String, &usize)| format!("{count} statements '{key}' are not used");
         self.obj.remarks.extend(self.unsupported_counts.iter().take(MAX_REMARKS).map(remark));
         Ok(self.obj)
@@ -193,6 +206,10 @@ pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     words.take_while(|word| !word.starts_with(b"#"))
 }
 
+fn has_comment(line: &[u8]) -> bool {
+    line.split(u8::is_ascii_whitespace).any(|word| word.starts_with(b"#"))
+}
+
 /// The text after the first word: a name that may contain spaces.
 pub(super) fn text_after_key(line: &[u8]) -> String {
     let text = String::from_utf8_lossy(line);
@@ -202,17 +219,17 @@ pub(super) fn text_after_key(line: &[u8]) -> String {
         .to_owned()
 }
 
-/// Parses a finite number.
+/// Parses a number, which may be infinite or not a number.
 pub(super) fn parse_number(word: &[u8]) -> Option<f32> {
-    std::str::from_utf8(word).ok()?.parse().ok().filter(|number: &f32| number.is_finite())
+    std::str::from_utf8(word).ok()?.parse().ok()
 }
 
-/// Parses three finite numbers. `key` and `line` are part of the error.
+/// Parses three numbers. `key` and `line` are part of the error.
 fn parse_vector<'a>(mut words: impl Iterator<Item = &'a [u8]>, key: &str, line: usize) -> Result<[f32; 3]> {
     let mut numbers = [0.0; 3];
     for number in &mut numbers {
         let word = words.next();
-        *number = word.and_then(parse_number).ok_or_else(|| number_error(key, "three finite numbers", word, line))?;
+        *number = word.and_then(parse_number).ok_or_else(|| number_error(key, "three numbers", word, line))?;
     }
     Ok(numbers)
 }
@@ -220,7 +237,7 @@ fn parse_vector<'a>(mut words: impl Iterator<Item = &'a [u8]>, key: &str, line: 
 fn parse_texture_coordinates<'a>(mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<[f32; 2]> {
     let (u, v) = (words.next(), words.next());
     let parse = |word: Option<&[u8]>| {
-        word.and_then(parse_number).ok_or_else(|| number_error("vt", "one to three finite numbers", word, line))
+        word.and_then(parse_number).ok_or_else(|| number_error("vt", "one to three numbers", word, line))
     };
     Ok([parse(u)?, if v.is_some() { parse(v)? } else { 0.0 }])
 }
@@ -231,15 +248,10 @@ fn number_error(key: &str, expected: &str, word: Option<&[u8]>, line: usize) -> 
 }
 
 /// Converts an index of the file to an index from 0. A positive index counts from 1, a negative one backwards from the
-/// last of the `count` elements so far.
-fn resolve_index(digits: &[u8], count: usize) -> Result<u32> {
-    let text = String::from_utf8_lossy(digits);
-    let invalid_index = |expected: String| invalid("index", expected, &text);
-    let index: i64 = text.parse().map_err(|_| invalid_index("a whole number".into()))?;
-    let zero_based_index =
-        if index < 0 { i64::try_from(count).ok().and_then(|count| count.checked_add(index)) } else { Some(index - 1) };
-    let valid_index = zero_based_index.and_then(|index| u32::try_from(index).ok()).filter(|index| *index != NO_INDEX);
-    valid_index.ok_or_else(|| invalid_index(format!("1 to {count} or -{count} to -1")))
+/// last of the `count` elements so far. `None` for an index that no element can have.
+fn resolve_index(index: i64, count: usize) -> Option<u32> {
+    let zero_based_index = if index < 0 { i64::try_from(count).ok()?.checked_add(index)? } else { index - 1 };
+    u32::try_from(zero_based_index).ok().filter(|index| *index != NO_INDEX)
 }
 
 #[cfg(test)]
@@ -273,6 +285,18 @@ mod tests {
     }
 
     #[test]
+    fn backslash_at_the_end_of_a_comment_continues_nothing() {
+        let faces = "v 1 0 0\nv 0 1 0\nf 1 2 3\n";
+        for comment in ["# C:\\models\\", "g head # C:\\", "#\\"] {
+            for line_end in ["\n", "\r\n", "\r"] {
+                let text = format!("{comment}\nv 0 0 0\n{faces}").replace('\n', line_end);
+                let obj = ObjFile::parse(text.as_bytes(), None).expect("a valid file");
+                assert_eq!(obj.polygons.positions.len(), 3, "{text:?}");
+            }
+        }
+    }
+
+    #[test]
     fn byte_order_mark_is_no_part_of_the_first_statement() {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
         let marked = ObjFile::parse(format!("\u{feff}{text}").as_bytes(), None).expect("a valid file");
@@ -295,24 +319,78 @@ mod tests {
             ("f 1 2 4294967296", "line 4: f: v: index: expected 1 to 3 or -3 to -1, got 4294967296"),
             ("f 1 2 2147483648", "line 4: f: index of v: expected 1 to 3, got 2147483648"),
             ("f 1 2 99999999999999999999", "line 4: f: v: index: expected a whole number, got 99999999999999999999"),
-            ("f 1 2 3/1", "line 4: f: index of vt: expected no index in a file without vt, got 1"),
-            ("f 1 2 3//7", "line 4: f: index of vn: expected no index in a file without vn, got 7"),
+            ("f 1 2 3/x", "line 4: f: vt: index: expected a whole number, got x"),
             ("f 1 2 3/1/1/1", "line 4: f: expected corners of the form v, v/vt, v//vn or v/vt/vn, got 3/1/1/1"),
             ("f 1 2 /1", "line 4: f: expected corners of the form v, v/vt, v//vn or v/vt/vn, got /1"),
-            ("f 1 2", "line 4: f: expected at least 3 corners, got 2"),
-            ("v 1 nan 2\nf 1 2 3", "line 4: v: expected three finite numbers, got nan"),
-            ("v 1 1e39 2\nf 1 2 3", "line 4: v: expected three finite numbers, got 1e39"),
-            ("v 1 2\nf 1 2 3", "line 4: v: expected three finite numbers, got the end of the line"),
-            ("v 1 2 3 0 nan 0\nf 1 2 3", "line 4: v: color: expected three finite numbers, got nan"),
-            ("v 1 2 3 0 0 300\nf 1 2 3", "line 4: v: color: expected 0 to 1, or 0 to 255, got [0.0, 0.0, 300.0]"),
-            ("v 1 2 3 0 -1 0\nf 1 2 3", "line 4: v: color: expected 0 to 1, or 0 to 255, got [0.0, -1.0, 0.0]"),
-            ("vt\nf 1 2 3", "line 4: vt: expected one to three finite numbers, got the end of the line"),
-            ("vn 0 0 x\nf 1 2 3", "line 4: vn: expected three finite numbers, got x"),
+            ("f 1 2", "faces: expected at least one face, got 1 points and lines"),
+            ("v 1 nan 2\nf 1 2 4", "line 5: f: position of vertex 4: expected finite numbers, got [1.0, NaN, 2.0]"),
+            ("v 1 1e39 2\nf 1 2 4", "line 5: f: position of vertex 4: expected finite numbers, got [1.0, inf, 2.0]"),
+            ("v 1 x 2\nf 1 2 3", "line 4: v: expected three numbers, got x"),
+            ("v 1 2\nf 1 2 3", "line 4: v: expected three numbers, got the end of the line"),
+            ("v 1 2 3 0 x 0\nf 1 2 3", "line 4: v: color: expected three numbers, got x"),
+            ("vt\nf 1 2 3", "line 4: vt: expected one to three numbers, got the end of the line"),
+            ("vn 0 0 x\nf 1 2 3", "line 4: vn: expected three numbers, got x"),
             ("", "faces: expected at least one face, got 0"),
         ] {
             let text = format!("{TRIANGLE}{statement}\n");
             assert_eq!(ObjFile::parse(text.as_bytes(), None).expect_err(statement).to_string(), message);
         }
+    }
+
+    /// Values that do not matter, each with its remark.
+    #[test]
+    fn values_without_effect_are_remarks() {
+        for (text, expected) in [
+            (
+                "f 1 2 3/1",
+                "index of vt: expected no index in a file without vt, got 1 (line 4: f): the index is ignored",
+            ),
+            (
+                "f 1//1 2//2 3//7",
+                "index of vn: expected no index in a file without vn, got 1 (line 4: f): the index is ignored (3 times)",
+            ),
+            ("f 1 2 3/-1", "index of vt: expected 1 to 0 or -0 to -1, got -1 (line 4: f): the index is ignored"),
+            ("f 1 2 3/0", "index of vt: expected 1 to 0 or -0 to -1, got 0 (line 4: f): the index is ignored"),
+            (
+                "vn nan 0 1\nf 1//1 2//1 3//1",
+                "normal: expected finite numbers, got [NaN, 0.0, 1.0] (normal 1): the normal is computed",
+            ),
+            (
+                "vt 0 inf\nf 1/1 2/1 3/1",
+                "texture coordinates: expected finite numbers, got [0.0, -inf] (texture coordinates 1): (0, 0) is used",
+            ),
+            (
+                "v 0 -nan 0\nf 1 2 3",
+                "position: expected finite numbers, got [0.0, NaN, 0.0] (vertex 4): no face uses the vertex",
+            ),
+            ("f 1 2\nf 1 2 3\nf 3", "faces: expected at least 3 corners, got 2 points and lines: they are not drawn"),
+            (
+                "v 1 2 3 0 -1 0\nf 1 2 3",
+                "color of a vertex: expected 0 to 1, got [0.0, -1.0, 0.0] (vertex 4): the channels are clamped",
+            ),
+        ] {
+            let text = format!("{TRIANGLE}{text}\n");
+            let polygons = ObjFile::parse(text.as_bytes(), None).expect(&text).polygons;
+            assert_eq!(polygons.corrections.remarks(false), Ok(vec![expected.to_owned()]));
+            assert!(polygons.corrections.remarks(true).is_err(), "{text}: expected an error in strict mode");
+            assert!(polygons.positions.as_flattened().iter().all(|number| number.is_finite()));
+        }
+    }
+
+    #[test]
+    fn seven_numbers_have_a_weight_if_it_is_1_everywhere() {
+        let colors = |vertices: &str| {
+            let polygons = ObjFile::parse(format!("{vertices}f 1 2 3\n").as_bytes(), None).expect("a file").polygons;
+            (polygons.colors[0], polygons.corrections.remarks(true).expect("no correction").remove(0))
+        };
+        let (color, note) = colors("v 0 0 0 1 0.5 0.25 0\nv 1 0 0 1.0 1 0 0\nv 0 1 0\n");
+        assert_eq!(
+            (color, note.as_str()),
+            ([0.5, 0.25, 0.0], "2 vertices have seven numbers, read as x y z w r g b: w is 1")
+        );
+        let (color, note) = colors("v 0 0 0 1 0.5 0.25 0\nv 1 0 0 0.5 1 0 0\nv 0 1 0\n");
+        assert_eq!(color, [1.0, 0.5, 0.25]);
+        assert!(note.starts_with("2 vertices have seven numbers, read as x y z r g b a, because the fourth"), "{note}");
     }
 
     #[test]

@@ -3,7 +3,9 @@
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::{DefaultElement, ElementDef, Encoding, KeyMap, PropertyType, ScalarType};
 
+use super::reader::quote;
 use crate::error::{Result, invalid};
+use crate::load::text::without_byte_order_mark;
 
 /// The largest length of a header in bytes.
 const MAX_HEADER_BYTES: usize = 64 << 10;
@@ -13,7 +15,7 @@ const MAX_LISTED_NAMES: usize = 8;
 /// The properties that are read, of vertices and faces.
 const VERTEX_PROPERTIES: [&str; 16] =
     ["x", "y", "z", "nx", "ny", "nz", "s", "t", "u", "v", "texture_u", "texture_v", "red", "green", "blue", "alpha"];
-const FACE_PROPERTIES: [&str; 3] = ["vertex_indices", "vertex_index", "texcoord"];
+const FACE_PROPERTIES: [&str; 4] = ["vertex_indices", "vertex_index", "texcoord", "texnumber"];
 
 /// A valid header.
 #[derive(Debug)]
@@ -30,28 +32,26 @@ impl PlyHeader {
     /// `Invalid` if the header is malformed or too long, lacks the position or the faces, names a property twice, or
     /// declares more elements than the file can contain.
     pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8])> {
-        let start = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
-        let end = start.windows(10).position(|window| window == b"end_header");
-        if !start.starts_with(b"ply") || end.is_none() {
+        let Some((text, body)) = split_header(without_byte_order_mark(bytes)?) else {
             let expected = format!("ply, and end_header within {MAX_HEADER_BYTES} bytes");
             return Err(invalid("header", expected, format!("{} bytes without them", bytes.len())));
-        }
-        let mut reader = Reader::new(bytes);
-        let header = Parser::<DefaultElement>::new().read_header(&mut reader).map_err(|error| {
-            let reason: String = error.to_string().chars().take(super::MAX_REASON_CHARACTERS).collect();
-            invalid("header", "a PLY header", reason.replace(['\n', '\t'], " "))
-        })?;
-        let body = reader.into_inner();
-        check_repetitions(&bytes[..bytes.len() - body.len()], &header.elements)?;
+        };
+        let header = Parser::<DefaultElement>::new().read_header(&mut Reader::new(text.as_bytes()));
+        let header = header.map_err(|error| invalid("header", "a PLY header", quote(error.to_string().as_bytes())))?;
+        check_repetitions(text.as_bytes(), &header.elements)?;
         let header = Self { encoding: header.encoding, elements: header.elements, comments: header.comments };
         header.check_elements(body.len())?;
         Ok((header, body))
     }
 
-    /// The image that the comment `TextureFile` names.
-    pub(super) fn texture_file(&self) -> Option<String> {
-        let names = self.comments.iter().filter_map(|comment| comment.trim().strip_prefix("TextureFile "));
-        names.map(|name| name.trim().replace('\\', "/")).find(|name| !name.is_empty())
+    /// The images that comments `TextureFile` name, in any case, in their order.
+    pub(super) fn texture_files(&self) -> Vec<String> {
+        let name = |comment: &String| {
+            let (key, name) = comment.trim().split_once(' ')?;
+            let is_image = key.eq_ignore_ascii_case("TextureFile") && !name.trim().is_empty();
+            is_image.then(|| name.trim().replace('\\', "/"))
+        };
+        self.comments.iter().filter_map(name).collect()
     }
 
     /// Names the properties and elements that are not used.
@@ -110,6 +110,38 @@ impl PlyHeader {
             }
         }
         Ok(())
+    }
+}
+
+/// Splits a file after its header. Returns the header as text with one blank between words and `\n` at the end of lines, and
+/// the bytes after it. Lines can end with `\n`, `\r\n` or `\r`. Comments that are not UTF-8 are read as Latin-1.
+fn split_header(bytes: &[u8]) -> Option<(String, &[u8])> {
+    let (mut text, mut rest) = (String::new(), &bytes[..bytes.len().min(MAX_HEADER_BYTES)]);
+    let mut has_cr_lf = false;
+    loop {
+        let length = rest.iter().position(|byte| matches!(byte, b'\n' | b'\r'));
+        let (line, line_end) = rest.split_at(length.unwrap_or(rest.len()));
+        let decoded = std::str::from_utf8(line)
+            .map_or_else(|_| line.iter().map(|byte| char::from(*byte)).collect(), str::to_owned);
+        let is_comment = decoded.trim_start().starts_with("comment");
+        let words = decoded.splitn(if is_comment { 2 } else { usize::MAX }, [' ', '\t']);
+        let words = words.map(str::trim).filter(|word| !word.is_empty());
+        let line = words.collect::<Vec<_>>().join(" ");
+        if text.is_empty() {
+            has_cr_lf = line_end.starts_with(b"\r\n");
+            if line != "ply" {
+                return None;
+            }
+        }
+        text.push_str(&line);
+        text.push('\n');
+        // After a lone `\r`, a `\n` can be the first byte of the data.
+        let line_end_length = if has_cr_lf && line_end.starts_with(b"\r\n") { 2 } else { line_end.len().min(1) };
+        rest = &line_end[line_end_length..];
+        if line == "end_header" {
+            return Some((text, &bytes[bytes.len().min(MAX_HEADER_BYTES) - rest.len()..]));
+        }
+        length?;
     }
 }
 

@@ -8,6 +8,7 @@ mod vertex_colors;
 pub(super) use build::{build_all_faces, build_faces};
 pub(super) use vertex_colors::{VertexColors, linear_from_srgb, paint};
 
+use super::values::{CorrectedValue, Corrections};
 use crate::error::{Result, invalid};
 use crate::memory::TemporaryReservation;
 
@@ -40,7 +41,7 @@ pub(super) struct Face {
     place: usize,
 }
 
-/// Polygons with shared vertices. The indices are validated by [`PolygonMesh::check`].
+/// Polygons with shared vertices. The indices and numbers are validated by [`PolygonMesh::validate`].
 #[derive(Debug, Default)]
 pub(super) struct PolygonMesh {
     /// Rest positions, in the order of the file.
@@ -48,10 +49,14 @@ pub(super) struct PolygonMesh {
     /// Texture coordinates with (0, 0) at the top left.
     pub(super) uvs: Vec<[f32; 2]>,
     pub(super) normals: Vec<[f32; 3]>,
-    /// One sRGB color per vertex, 0 to 1; empty if no vertex has a color.
+    /// One sRGB color per vertex, after the validation 0 to 1; empty if no vertex has a color.
     pub(super) colors: Vec<[f32; 3]>,
     pub(super) faces: Vec<Face>,
     corners: Vec<Corner>,
+    /// Number of faces with one or two corners: points and lines.
+    small_face_count: usize,
+    /// The values that were changed or ignored.
+    pub(super) corrections: Corrections,
     /// Material names in order of first use.
     pub(super) materials: Vec<String>,
     /// The memory of the lists, which grows with them. `None`: unlimited.
@@ -103,10 +108,10 @@ impl PolygonMesh {
         if bytes > memory.bytes() { memory.grow_to(bytes + bytes / 2) } else { Ok(()) }
     }
 
-    /// Adds a polygon.
+    /// Adds a polygon. Points and lines, with fewer than three corners, are only counted.
     ///
     /// # Errors
-    /// `Invalid` for fewer than three corners, `OutOfMemory`.
+    /// `OutOfMemory`.
     pub(super) fn add_face(
         &mut self,
         corners: impl IntoIterator<Item = Corner>,
@@ -117,7 +122,9 @@ impl PolygonMesh {
         self.corners.extend(corners);
         let corner_count = self.corners.len() - first_corner;
         if corner_count < 3 {
-            return Err(invalid("face", "at least 3 corners", corner_count));
+            self.corners.truncate(first_corner);
+            self.small_face_count += 1;
+            return Ok(());
         }
         self.faces.push(Face { first_corner, corner_count, material, place });
         self.reserve_lists()
@@ -134,34 +141,72 @@ impl PolygonMesh {
         self.corners.iter().any(|corner| corner.uv != NO_INDEX)
     }
 
-    /// Checks that the mesh has a face and that all indices are in range. `place` converts the line or index of a face
-    /// to its location in an error. `first_index` is the index of the first vertex in the file format, 0 or 1.
+    /// Checks that the mesh has a face, that all indices of vertices are in range and that the positions of these vertices
+    /// are finite. Corrects all other values as the table of [`super::values`] states. `place` converts the line or index of
+    /// a face to its location in an error. `first_index` is the index of the first vertex in the file format, 0 or 1.
     ///
     /// # Errors
-    /// `Invalid` with the place of the face, and the range of valid indices.
-    pub(super) fn check(&self, place: impl Fn(usize) -> String, first_index: u64) -> Result<()> {
+    /// `Invalid` with the place of the face, and the range of valid indices or the position.
+    pub(super) fn validate(&mut self, place: impl Fn(usize) -> String, first_index: u64) -> Result<()> {
+        let small_faces = self.small_face_count;
         if self.faces.is_empty() {
-            return Err(invalid("faces", "at least one face", 0));
+            let given = if small_faces > 0 { format!("{small_faces} points and lines") } else { "0".into() };
+            return Err(invalid("faces", "at least one face", given));
         }
-        for (index, face) in self.faces.iter().enumerate() {
-            for corner in self.corners_of(index) {
-                for (list, index, count) in [
-                    ("v", corner.vertex, self.positions.len()),
-                    ("vt", corner.uv, self.uvs.len()),
-                    ("vn", corner.normal, self.normals.len()),
-                ] {
-                    let is_missing = index == NO_INDEX && list != "v";
-                    if !is_missing && index as usize >= count {
-                        let expected = match count as u64 {
-                            0 => format!("no index in a file without {list}"),
-                            count => format!("{first_index} to {}", count - 1 + first_index),
-                        };
-                        let field = format!("{}: index of {list}", place(face.place));
-                        return Err(invalid(field, expected, u64::from(index) + first_index));
+        if small_faces > 0 {
+            let given = || CorrectedValue::new("", "at least 3 corners", format!("{small_faces} points and lines"));
+            self.corrections.add("faces", "they are not drawn", given);
+        }
+        for face in &self.faces {
+            for corner in &mut self.corners[face.first_corner..][..face.corner_count] {
+                let lists = [
+                    ("v", &mut corner.vertex, self.positions.len()),
+                    ("vt", &mut corner.uv, self.uvs.len()),
+                    ("vn", &mut corner.normal, self.normals.len()),
+                ];
+                for (list, index, count) in lists {
+                    if (*index as usize) < count || (*index == NO_INDEX && list != "v") {
+                        continue;
                     }
+                    let expected = match count as u64 {
+                        0 => format!("no index in a file without {list}"),
+                        count => format!("{first_index} to {}", count - 1 + first_index),
+                    };
+                    let (field, given) = (format!("index of {list}"), u64::from(*index) + first_index);
+                    if list == "v" {
+                        return Err(invalid(format!("{}: {field}", place(face.place)), expected, given));
+                    }
+                    let given = || CorrectedValue::new(place(face.place), expected, given);
+                    self.corrections.add(&field, "the index is ignored", given);
+                    *index = NO_INDEX;
+                }
+                let position = self.positions[corner.vertex as usize];
+                if position.iter().any(|number| !number.is_finite()) {
+                    let vertex = u64::from(corner.vertex) + first_index;
+                    let field = format!("{}: position of vertex {vertex}", place(face.place));
+                    return Err(invalid(field, "finite numbers", format!("{position:?}")));
                 }
             }
         }
+        self.correct_attributes(first_index);
         Ok(())
+    }
+
+    /// Corrects the numbers that no position of a face has.
+    fn correct_attributes(&mut self, first_index: u64) {
+        // An unused vertex at the place of a used one does not change the bounds of the mesh.
+        let used_position = self.corners.first().map_or([0.0; 3], |corner| self.positions[corner.vertex as usize]);
+        for (index, position) in self.positions.iter_mut().enumerate() {
+            if position.iter().any(|number| !number.is_finite()) {
+                let place = format!("vertex {}", index as u64 + first_index);
+                let given = || CorrectedValue::new(place, "finite numbers", format!("{position:?}"));
+                self.corrections.add("position", "no face uses the vertex", given);
+                *position = used_position;
+            }
+        }
+        let corrections = &mut self.corrections;
+        corrections.zero_non_finite("normal", "the normal is computed", &mut self.normals, first_index);
+        corrections.zero_non_finite("texture coordinates", "(0, 0) is used", &mut self.uvs, first_index);
+        corrections.vertex_colors(&mut self.colors, first_index);
     }
 }
