@@ -21,6 +21,16 @@ pub struct Texture {
     rgba: Vec<u8>,
 }
 
+/// Largest memory in bytes of a WebP decoder. A lossy image has a luma and two chroma planes, whose sides are multiples of 16,
+/// and RGB and alpha planes while they are combined; a lossless one has an RGBA image. The file is copied, and its tables of
+/// symbols have several entries per byte.
+const fn webp_bytes(file_bytes: u64, width: u32, height: u32) -> u64 {
+    const BYTES_PER_PIXEL: u64 = 10;
+    const BYTES_PER_FILE_BYTE: u64 = 16;
+    let pixels = (width as u64).next_multiple_of(16) * (height as u64).next_multiple_of(16);
+    BYTES_PER_PIXEL * pixels + BYTES_PER_FILE_BYTE * file_bytes
+}
+
 impl Texture {
     /// A texture from its pixels.
     ///
@@ -45,36 +55,38 @@ impl Texture {
     /// Number of bytes at the start of a file that [`Self::is_supported`] needs.
     pub const SIGNATURE_BYTES: usize = 16;
 
-    /// Whether a file that starts with these bytes is a PNG or JPEG image.
+    /// Whether a file that starts with these bytes is a PNG, JPEG or WebP image.
     pub fn is_supported(start: &[u8]) -> bool {
-        matches!(image::guess_format(start), Ok(ImageFormat::Png | ImageFormat::Jpeg))
+        matches!(image::guess_format(start), Ok(ImageFormat::Png | ImageFormat::Jpeg | ImageFormat::WebP))
     }
 
-    /// Decodes PNG or JPEG bytes. Reserves the memory of the pixels in `memory` as soon as the header is read.
+    /// Decodes PNG, JPEG or WebP bytes. Reserves the memory of the pixels in `memory` as soon as the header is read.
     ///
     /// # Errors
-    /// `Invalid` if the bytes are neither a PNG nor a JPEG image, or a side exceeds 8192 pixels. `OutOfMemory`.
+    /// `Invalid` if the bytes are no PNG, JPEG or WebP image, or a side exceeds 8192 pixels. `OutOfMemory`.
     pub fn decode(name: impl Into<String>, bytes: &[u8], memory: &Arc<MemoryReservation>) -> Result<Self> {
         let name = name.into();
         let decode_error =
-            |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG or JPEG image", error);
+            |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG, JPEG or WebP image", error);
         let mut reader = ImageReader::new(Cursor::new(bytes));
         let mut limits = image::Limits::default();
         limits.max_image_width = Some(MAX_TEXTURE_SIDE);
         limits.max_image_height = Some(MAX_TEXTURE_SIDE);
         reader.limits(limits);
         let reader = reader.with_guessed_format().map_err(|error| decode_error(&error))?;
-        let is_jpeg = reader.format() == Some(ImageFormat::Jpeg);
+        let format = reader.format();
         let decoder = reader.into_decoder().map_err(|error| decode_error(&error))?;
         let (width, height) = decoder.dimensions();
         let object = format!("texture '{name}' of {width} x {height} pixels");
-        // The decoded image in the format of the file is freed after its conversion to RGBA8. A JPEG decoder copies the
-        // file, and keeps the coefficients of some images.
-        let of_jpeg = match is_jpeg {
-            true => bytes.len() as u64 + coefficient_bytes(bytes, width, height),
-            false => 0,
+        // The decoded image in the format of the file is freed after its conversion to RGBA8.
+        let file_bytes = bytes.len() as u64;
+        let of_decoder = match format {
+            // The decoder copies the file, and keeps the coefficients of some images.
+            Some(ImageFormat::Jpeg) => file_bytes + coefficient_bytes(bytes, width, height),
+            Some(ImageFormat::WebP) => webp_bytes(file_bytes, width, height),
+            _ => 0,
         };
-        let _decoded = memory.reserve_temporary(&object, decoder.total_bytes().saturating_add(of_jpeg))?;
+        let _decoded = memory.reserve_temporary(&object, decoder.total_bytes().saturating_add(of_decoder))?;
         memory.reserve(&object, 4 * u64::from(width) * u64::from(height))?;
         let image = image::DynamicImage::from_decoder(decoder).map_err(|error| decode_error(&error))?.into_rgba8();
         Self::new(name, width, height, image.into_raw())

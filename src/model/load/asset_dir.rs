@@ -136,7 +136,7 @@ impl AssetDir {
     }
 
     /// The reason why the image that another file refers to is not drawn, worded as the end of a remark. `None` for a
-    /// PNG or JPEG image.
+    /// PNG, JPEG or WebP image.
     ///
     /// # Errors
     /// As for [`Self::has_referenced_file`] and [`Self::read_start`]; in strict mode, also for other formats.
@@ -151,12 +151,12 @@ impl AssetDir {
     /// As [`Self::unusable_image`], for an image that starts with the bytes `start`.
     ///
     /// # Errors
-    /// In strict mode, `Invalid` for other formats than PNG and JPEG.
+    /// In strict mode, `Invalid` for other formats than PNG, JPEG and WebP.
     pub(super) fn unsupported_image(&self, name: &str, start: &[u8]) -> Result<Option<&'static str>> {
         match (Texture::is_supported(start), self.is_strict) {
             (true, _) => Ok(None),
-            (false, false) => Ok(Some("is neither a PNG nor a JPEG image")),
-            (false, true) => Err(invalid(field_of(name), "a PNG or JPEG image", "another format (strict mode)")),
+            (false, false) => Ok(Some("is no PNG, JPEG or WebP image")),
+            (false, true) => Err(invalid(field_of(name), "a PNG, JPEG or WebP image", "another format (strict mode)")),
         }
     }
 

@@ -94,6 +94,14 @@ const MODES: &[Conversion] = &[
     },
 ];
 
+/// Decompresses a glTF file.
+const COMPRESSED: Conversion = Conversion {
+    extensions: &["glb", "gltf"],
+    command: "gltf-transform copy INPUT OUTPUT",
+    output: "uncompressed.glb",
+    setup: "`npm install --global @gltf-transform/cli`",
+};
+
 impl Conversion {
     /// The command for the file `name`.
     fn command_for(&self, name: &str) -> String {
@@ -103,6 +111,11 @@ impl Conversion {
             word => word.to_owned(),
         });
         words.collect::<Vec<_>>().join(" ")
+    }
+
+    /// The command for the file `name` in parentheses after a space.
+    fn hint(&self, name: &str) -> String {
+        format!(" (convert it in its folder with `{}` after {})", self.command_for(name), self.setup)
     }
 }
 
@@ -118,6 +131,11 @@ pub(super) fn model_hint(name: &str) -> String {
     hint(MODELS, name)
 }
 
+/// How a compressed glTF file becomes one that is read, as for [`model_hint`].
+pub(super) fn compression_hint(name: &str) -> String {
+    COMPRESSED.hint(name)
+}
+
 /// As [`model_hint`], for a file of modes.
 pub(super) fn modes_hint(name: &str) -> String {
     hint(MODES, name)
@@ -126,9 +144,7 @@ pub(super) fn modes_hint(name: &str) -> String {
 fn hint(conversions: &[Conversion], name: &str) -> String {
     let extension = extension_of(name);
     let conversion = conversions.iter().find(|conversion| conversion.extensions.contains(&extension.as_str()));
-    conversion.map_or_else(String::new, |conversion| {
-        format!(" (convert it in its folder with `{}` after {})", conversion.command_for(name), conversion.setup)
-    })
+    conversion.map_or_else(String::new, |conversion| conversion.hint(name))
 }
 
 #[cfg(test)]

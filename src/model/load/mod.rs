@@ -17,7 +17,7 @@
 //! - Normals of a file are kept. Missing normals are smooth except along creases, which split the corners of a vertex
 //!   but not the vertex itself (module `domain::creases`).
 //! - Values out of range: module `values` has the table that all formats share.
-//! - A file that does not exist although another file refers to it, and an image that is neither PNG nor JPEG, are
+//! - A file that does not exist although another file refers to it, and an image that is no PNG, JPEG or WebP image, are
 //!   replaced by a default with a remark. In strict mode, they are errors.
 
 mod asset_dir;

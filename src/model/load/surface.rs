@@ -95,11 +95,14 @@ fn color_vertices(polygons: &PolygonMesh, mesh: Mesh, parts: &mut SceneParts) ->
             (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
         }
     }
-    let linear_colors: Vec<[f32; 3]> =
-        polygons.colors.iter().map(|color| color.map(polygons::linear_from_srgb)).collect();
+    let linear_color = |color: &[f32; 3]| {
+        let [red, green, blue] = color.map(polygons::linear_from_srgb);
+        [red, green, blue, 1.0]
+    };
+    let linear_colors: Vec<[f32; 4]> = polygons.colors.iter().map(linear_color).collect();
     match polygons::paint(&mesh, &linear_colors)? {
-        VertexColors::Uniform(color) => {
-            parts.materials.iter_mut().for_each(|material| material.multiply_color(color));
+        VertexColors::Uniform([red, green, blue, _]) => {
+            parts.materials.iter_mut().for_each(|material| material.multiply_color([red, green, blue]));
             Ok(mesh)
         }
         VertexColors::Image(painted) => {

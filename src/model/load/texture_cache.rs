@@ -17,7 +17,7 @@ impl TextureCache {
     /// Returns the index of the texture in the file `path`. The first call for a file decodes it.
     ///
     /// # Errors
-    /// `Invalid` if the file does not exist or is not a PNG or JPEG image.
+    /// `Invalid` if the file does not exist or is not a PNG, JPEG or WebP image.
     pub(super) fn load(&mut self, files: &AssetDir, path: &str) -> Result<usize> {
         self.get_or_insert_with(path, || decode(files, path))
     }

@@ -7,7 +7,7 @@
 //! | normal | normalized | normalized | computed from the faces, remark |
 //! | texture coordinates | | | (0, 0), remark |
 //! | color of a vertex, 0 to 1 | clamped | clamped, remark | white, remark |
-//! | colors of vertices, 0 to 255: most channels above 2, or whole numbers | clamped | clamped, remark | white, remark |
+//! | colors of vertices, 0 to 255: half of the channels above 0 are above 2 | clamped | clamped, remark | white, remark |
 //! | color, opacity or factor of a material, 0 to 1 | clamped | clamped, remark | default, remark |
 //! | exponent of a material, 0 to 1e6 | clamped | clamped, remark | default, remark |
 //! | displacement of a vertex that a face uses (morph target, U) | | | error with the vertex |
@@ -129,18 +129,18 @@ impl Corrections {
         Some([red?, green?, blue?])
     }
 
-    /// Replaces vectors that are not finite by zeros. `name` is the name of one vector.
+    /// Replaces vectors that are not finite by zeros.
     pub(super) fn zero_non_finite<const N: usize>(
         &mut self,
-        name: &str,
+        subject: &str,
         treatment: &str,
         vectors: &mut [[f32; N]],
         first_index: u64,
     ) {
         for (index, vector) in vectors.iter_mut().enumerate() {
             if vector.iter().any(|number| !number.is_finite()) {
-                let place = format!("{name} {}", index as u64 + first_index);
-                self.add(name, treatment, || CorrectedValue::new(place, "finite numbers", format!("{vector:?}")));
+                let place = format!("element {}", index as u64 + first_index);
+                self.add(subject, treatment, || CorrectedValue::new(place, "finite numbers", format!("{vector:?}")));
                 *vector = [0.0; N];
             }
         }
@@ -150,8 +150,7 @@ impl Corrections {
     pub(super) fn vertex_colors(&mut self, colors: &mut [[f32; 3]], first_index: u64) {
         let channels = || colors.as_flattened().iter().filter(|channel| channel.is_finite() && **channel > 0.0);
         let large_count = channels().filter(|channel| **channel > MAX_UNIT_CHANNEL).count();
-        let is_whole = || channels().all(|channel| channel.fract() == 0.0);
-        let scale = if large_count > 0 && (2 * large_count > channels().count() || is_whole()) { 255.0 } else { 1.0 };
+        let scale = if large_count > 0 && 2 * large_count >= channels().count() { 255.0 } else { 1.0 };
         if scale > 1.0 {
             self.add_note("colors of vertices are divided by 255, because they exceed 1".into());
         }

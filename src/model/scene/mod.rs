@@ -51,6 +51,9 @@ use std::sync::Arc;
 use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
 
+/// The smallest plausible value of the largest eigenvalue of a domain in (rad/s)^2: a period of 55 hours.
+const MIN_LARGEST_EIGENVALUE: f64 = 1e-9;
+
 /// Largest magnitude of a negative eigenvalue that counts as a rounding error, as a fraction of the largest magnitude
 /// of its domain. Solvers return the eigenvalues of rigid motions as numbers near 0 of either sign.
 const EIGENVALUE_ROUNDING: f64 = 1e-9;
@@ -163,6 +166,7 @@ impl Scene {
         parts.look.check()?;
         drop_textures_without_uvs(&mut parts);
         parts.remarks.extend(negative_eigenvalues(&parts.domains));
+        parts.remarks.extend(slow_eigenvalues(&parts.domains));
         add_tangents(&mut parts);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let features = SceneFeatures::from_parts(&parts);
@@ -346,6 +350,23 @@ fn negative_eigenvalues(domains: &[Domain]) -> Option<String> {
     ))
 }
 
+/// A remark on the domains whose largest eigenvalue belongs to a period of days. Such numbers are not in (rad/s)^2.
+fn slow_eigenvalues(domains: &[Domain]) -> Option<String> {
+    let largest = |domain: &Domain| {
+        let largest = domain.metadata.eigenvalues.iter().copied().fold(0.0, f64::max);
+        (largest > 0.0 && largest < MIN_LARGEST_EIGENVALUE).then_some(largest)
+    };
+    let mut found = domains.iter().filter_map(|domain| Some((&domain.name, largest(domain)?)));
+    let (name, value) = found.next()?;
+    let others = found.count();
+    let more = if others > 0 { format!(", and in {others} other domains") } else { String::new() };
+    let period = std::f64::consts::TAU / value.sqrt();
+    Some(format!(
+        "the largest eigenvalue is {value:e} (rad/s)^2 in '{name}'{more}, a period of {period:.0e} s: modes do not move \
+         visibly in a simulation"
+    ))
+}
+
 /// Replaces the materials of domains without texture coordinates by untextured copies, because a texture would show the
 /// same texel everywhere. Each replaced material adds a remark.
 fn drop_textures_without_uvs(parts: &mut SceneParts) {
@@ -471,6 +492,20 @@ mod tests {
         let negative = remarks(&[-4.0, 100.0]);
         assert!(negative.len() == 1 && negative[0].starts_with("negative eigenvalue -4 (rad/s)^2 in "), "{negative:?}");
         for eigenvalues in [&[-1e-8, 100.0][..], &[0.0, 100.0], &[]] {
+            assert_eq!(remarks(eigenvalues), [""; 0], "{eigenvalues:?}");
+        }
+    }
+
+    #[test]
+    fn eigenvalues_of_periods_of_days_are_remarked() {
+        let remarks = |eigenvalues: &[f64]| {
+            let mut parts = square(vec![]);
+            parts.domains[0].metadata.eigenvalues = eigenvalues.to_vec();
+            Scene::new(parts).expect("a scene").remarks.clone()
+        };
+        let slow = remarks(&[1e-30, 2e-31]);
+        assert!(slow.len() == 1 && slow[0].starts_with("the largest eigenvalue is 1e-30 (rad/s)^2 in "), "{slow:?}");
+        for eigenvalues in [&[1e-30, 100.0][..], &[0.0], &[1e-6]] {
             assert_eq!(remarks(eigenvalues), [""; 0], "{eigenvalues:?}");
         }
     }

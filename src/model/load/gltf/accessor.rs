@@ -9,16 +9,50 @@ use super::get_element;
 use crate::error::{Result, invalid};
 
 // Component types of glTF.
+const I8: u64 = 5120;
 const U8: u64 = 5121;
+const I16: u64 = 5122;
 const U16: u64 = 5123;
 const U32: u64 = 5125;
 const F32: u64 = 5126;
 
+/// The types of the components of an attribute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ComponentTypes {
+    /// Floats, and integers as in the extension KHR_mesh_quantization.
+    Quantized,
+    /// Floats and normalized unsigned integers.
+    UnitInterval,
+    /// Unsigned integers that are not normalized.
+    Indices,
+    Floats,
+}
+
+impl ComponentTypes {
+    const fn allow(self, component_type: u64, is_normalized: bool) -> bool {
+        match self {
+            Self::Quantized => matches!(component_type, F32 | I8 | U8 | I16 | U16),
+            Self::UnitInterval => matches!((component_type, is_normalized), (F32, _) | (U8 | U16, true)),
+            Self::Indices => matches!((component_type, is_normalized), (U8 | U16, false)),
+            Self::Floats => component_type == F32,
+        }
+    }
+
+    /// For an error.
+    const fn list(self) -> &'static str {
+        match self {
+            Self::Quantized => "5126 (f32), 5120 (i8), 5121 (u8), 5122 (i16) or 5123 (u16)",
+            Self::UnitInterval => "5126 (f32), or normalized 5121 (u8) or 5123 (u16)",
+            Self::Indices => "5121 (u8) or 5123 (u16)",
+            Self::Floats => "5126 (f32)",
+        }
+    }
+}
+
 /// The formats in which an attribute is accepted.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct AttributeFormat {
-    /// Whether normalized unsigned integers are accepted in addition to floats.
-    pub(super) allows_integers: bool,
+    pub(super) components: ComponentTypes,
     /// The required number of elements. `None` allows any number. This is for the positions, which determine the number
     /// for the other attributes. With `None`, an accessor without a buffer view (its elements are zero or sparse) is
     /// rejected, because a large count without data could exhaust the memory.
@@ -48,13 +82,15 @@ impl AccessorReader<'_> {
 
     fn decode_vectors_of<const N: usize>(&self, accessor: &Accessor, format: AttributeFormat) -> Result<Vec<[f32; N]>> {
         // The accessor type with N components.
-        check_kind(accessor, ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1])?;
+        let kind = match N {
+            1..=4 => ["SCALAR", "VEC2", "VEC3", "VEC4"][N - 1],
+            _ => "MAT4",
+        };
+        check_kind(accessor, kind)?;
         let component_type = accessor.component_type;
-        let is_normalized_integer = format.allows_integers && accessor.normalized && matches!(component_type, U8 | U16);
-        if component_type != F32 && !is_normalized_integer {
-            let integer_types = if format.allows_integers { ", or normalized 5121 (u8) or 5123 (u16)" } else { "" };
+        if !format.components.allow(component_type, accessor.normalized) {
             let given = format!("{component_type}, normalized: {}", accessor.normalized);
-            return Err(invalid("componentType", format!("{F32} (f32){integer_types}"), given));
+            return Err(invalid("componentType", format.components.list(), given));
         }
         if let Some(count) = format.count.filter(|count| *count != accessor.count) {
             return Err(invalid("count", format!("{count}, the number of positions"), accessor.count));
@@ -65,10 +101,16 @@ impl AccessorReader<'_> {
         let packed_bytes = self.pack_elements(accessor, N)?;
         // Components of all types are decoded to four bytes.
         self.buffers.charge_budget(4 * N as u64 * accessor.count as u64)?;
+        // The value of a normalized integer, as the specification defines it.
+        let value = |number: f32, full: f32| if accessor.normalized { (number / full).max(-1.0) } else { number };
         Ok(match component_type {
-            U8 => group_components(packed_bytes.iter().map(|byte| f32::from(*byte) / 255.0)),
+            I8 => group_components(packed_bytes.iter().map(|byte| value(f32::from(byte.cast_signed()), 127.0))),
+            U8 => group_components(packed_bytes.iter().map(|byte| value(f32::from(*byte), 255.0))),
+            I16 => group_components(
+                split_components::<2>(&packed_bytes).map(|bytes| value(f32::from(i16::from_le_bytes(bytes)), 32767.0)),
+            ),
             U16 => group_components(
-                split_components::<2>(&packed_bytes).map(|bytes| f32::from(u16::from_le_bytes(bytes)) / 65535.0),
+                split_components::<2>(&packed_bytes).map(|bytes| value(f32::from(u16::from_le_bytes(bytes)), 65535.0)),
             ),
             _ => group_components(split_components::<4>(&packed_bytes).map(f32::from_le_bytes)),
         })
@@ -191,8 +233,8 @@ fn check_kind(accessor: &Accessor, kind: &str) -> Result<()> {
 /// Size of a component in bytes. `component_type` must be one of the supported types.
 const fn component_size(component_type: u64) -> usize {
     match component_type {
-        U8 => 1,
-        U16 => 2,
+        I8 | U8 => 1,
+        I16 | U16 => 2,
         _ => 4,
     }
 }

@@ -12,10 +12,11 @@ use super::hierarchy::{self, PlacedNode};
 use super::material::MaterialConverter;
 use super::primitive::{self, ConvertedPrimitive, PrimitiveOptions};
 use super::remarks::{ImportRemarks, sanitize};
+use super::skin;
 use super::texture::TextureLoader;
 use crate::domain::{Attachment, CreaseAngle, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
-use crate::scene::{MAX_DOMAINS, SceneParts};
+use crate::scene::{MAX_DOMAINS, NormalMethod, SceneParts};
 
 /// The domain to which the domains of a node's children are attached: the first domain of the node or, if the node has
 /// none, of its nearest ancestor with domains.
@@ -33,12 +34,24 @@ struct LoadedPrimitive {
     material: usize,
 }
 
+/// A primitive in the pose of a skin, or at rest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+struct PrimitiveKey {
+    mesh: usize,
+    primitive: usize,
+    skin: Option<usize>,
+}
+
 #[derive(Debug)]
 struct GltfAssembler<'a> {
     reader: AccessorReader<'a>,
     material_converter: MaterialConverter<'a>,
-    /// Converted primitives by the indices of mesh and primitive; `None` for points and lines.
-    primitives: HashMap<(usize, usize), Option<LoadedPrimitive>>,
+    /// Converted primitives; `None` for points and lines.
+    primitives: HashMap<PrimitiveKey, Option<LoadedPrimitive>>,
+    /// The world matrices of the nodes of the scene, by their index in the document.
+    world_by_node: HashMap<usize, Matrix4<f64>>,
+    /// Whether a morph target has normals.
+    has_target_normals: bool,
     crease_angle: CreaseAngle,
     /// Names of all nodes with a mesh so far.
     names: HashSet<String>,
@@ -63,6 +76,8 @@ pub(super) fn assemble(
         reader: AccessorReader { document, buffers },
         material_converter: MaterialConverter::new(document, TextureLoader::new(document, buffers)),
         primitives: HashMap::new(),
+        world_by_node: nodes.iter().map(|placed_node| (placed_node.node, placed_node.world)).collect(),
+        has_target_normals: false,
         crease_angle,
         names: HashSet::new(),
         shapes: Vec::new(),
@@ -76,13 +91,16 @@ pub(super) fn assemble(
             .map(|parent| ParentDomain { domain_from_node: parent.domain_from_node * placed_node.local, ..parent });
         let first_domain = assembly.add_node(placed_node, parent_domain);
         let first_domain = first_domain.map_err(|error| error.prefix_field(&format!("nodes[{}]", placed_node.node)))?;
-        let node_domain = first_domain.map(|domain| ParentDomain { domain, domain_from_node: Matrix4::identity() });
+        // The coordinates of a skinned domain are those of the world.
+        let is_skinned = document.nodes[placed_node.node].skin.is_some();
+        let domain_from_node = if is_skinned { placed_node.world } else { Matrix4::identity() };
+        let node_domain = first_domain.map(|domain| ParentDomain { domain, domain_from_node });
         parent_domains.push(node_domain.or(parent_domain));
     }
     if assembly.domains.is_empty() {
         return Err(invalid("scenes", "a node with at least one primitive of triangles", "none"));
     }
-    Ok(assembly.into_parts(name))
+    assembly.into_parts(name, buffers.is_strict())
 }
 
 impl GltfAssembler<'_> {
@@ -93,7 +111,19 @@ impl GltfAssembler<'_> {
         let Some(mesh_index) = node.mesh else { return Ok(None) };
         let mesh = get_element(&document.meshes, mesh_index, "mesh")?;
         let weights = node.weights.as_ref().or(mesh.weights.as_ref());
-        let placement = to_transform(&placed_node.world)?;
+        let joint_matrices = match node.skin {
+            Some(skin) => {
+                let world_of_node = |node| self.world_by_node.get(&node).copied();
+                Some(skin::joint_matrices(self.reader, skin, world_of_node)?)
+            }
+            None => None,
+        };
+        // The node of a skinned mesh does not move it.
+        let placement = match node.skin {
+            Some(_) => Transform::IDENTITY,
+            None => to_transform(&placed_node.world)?,
+        };
+        let parent_domain = parent_domain.filter(|_| node.skin.is_none());
         let attachment = parent_domain.map(|parent_domain| create_attachment(&parent_domain)).transpose()?;
         let first_domain = self.domains.len();
         // The node's first domain by rank. All domains of the node with the same rank share coordinates.
@@ -109,9 +139,9 @@ impl GltfAssembler<'_> {
             let add_primitive_location = |error: crate::error::Error| {
                 error.prefix_field(&format!("meshes[{mesh_index}].primitives[{primitive_index}]"))
             };
-            let Some(loaded) = self.load_primitive(mesh_index, primitive_index).map_err(add_primitive_location)? else {
-                continue;
-            };
+            let key = PrimitiveKey { mesh: mesh_index, primitive: primitive_index, skin: node.skin };
+            let loaded = self.load_primitive(key, joint_matrices.as_deref()).map_err(add_primitive_location)?;
+            let Some(loaded) = loaded else { continue };
             if self.domains.len() == MAX_DOMAINS {
                 return Err(invalid("domains", format!("at most {MAX_DOMAINS}"), MAX_DOMAINS + 1));
             }
@@ -133,27 +163,34 @@ impl GltfAssembler<'_> {
 
     /// Returns the shape and material of a primitive, or `None` for points and lines. The first call for a primitive
     /// converts it.
-    fn load_primitive(&mut self, mesh_index: usize, primitive_index: usize) -> Result<Option<LoadedPrimitive>> {
-        if let Some(loaded) = self.primitives.get(&(mesh_index, primitive_index)) {
+    fn load_primitive(
+        &mut self,
+        key: PrimitiveKey,
+        joint_matrices: Option<&[Matrix4<f64>]>,
+    ) -> Result<Option<LoadedPrimitive>> {
+        if let Some(loaded) = self.primitives.get(&key) {
             return Ok(*loaded);
         }
-        let primitive = &self.reader.document.meshes[mesh_index].primitives[primitive_index];
+        let primitive = &self.reader.document.meshes[key.mesh].primitives[key.primitive];
         let options = PrimitiveOptions {
             uv_set: self.material_converter.uv_set(primitive.material)?,
-            has_image: self.material_converter.has_image(primitive.material)?,
+            uv_transform: self.material_converter.uv_transform(primitive.material)?,
             crease_angle: self.crease_angle,
+            joint_matrices,
         };
         let loaded = match primitive::convert_primitive(self.reader, primitive, options, &mut self.remarks)? {
             None => None,
-            Some(ConvertedPrimitive { shape, colors, has_uvs }) => {
-                let material =
-                    self.material_converter.material_index(primitive.material, has_uvs, &mut self.remarks)?;
-                let material = self.material_converter.with_vertex_colors(material, colors);
-                self.shapes.push(shape);
+            Some(ConvertedPrimitive { mesh, modes, colors, has_target_normals }) => {
+                self.has_target_normals |= has_target_normals && modes.rank() > 0;
+                let has_uvs = !mesh.corners().uvs.is_empty();
+                let converter = &mut self.material_converter;
+                let material = converter.material_index(primitive.material, has_uvs, &mut self.remarks)?;
+                let (mesh, material) = converter.with_vertex_colors(material, mesh, colors, &mut self.remarks)?;
+                self.shapes.push(Shape::new(mesh, modes)?);
                 Some(LoadedPrimitive { shape: self.shapes.len() - 1, material })
             }
         };
-        self.primitives.insert((mesh_index, primitive_index), loaded);
+        self.primitives.insert(key, loaded);
         Ok(loaded)
     }
 
@@ -171,15 +208,21 @@ impl GltfAssembler<'_> {
         name
     }
 
-    fn into_parts(self, name: &str) -> SceneParts {
-        SceneParts {
+    fn into_parts(mut self, name: &str, is_strict: bool) -> Result<SceneParts> {
+        let mut parts = SceneParts {
             shapes: self.shapes,
             materials: self.material_converter.materials,
             textures: self.material_converter.texture_loader.textures,
             domains: self.domains,
-            remarks: self.remarks.into_list(),
             ..SceneParts::named(name)
+        };
+        if self.has_target_normals {
+            parts.deformation.normals = NormalMethod::Exact;
+            self.remarks
+                .add("normals of morph targets: exact normals of the deformed surface are drawn instead".into());
         }
+        parts.remarks = self.remarks.into_list(is_strict)?;
+        Ok(parts)
     }
 }
 

@@ -98,7 +98,7 @@ impl<'a> GltfBuffers<'a> {
         }
     }
 
-    /// The reason why an image is not drawn, worded as the end of a remark. `None` for a PNG or JPEG image.
+    /// The reason why an image is not drawn, worded as the end of a remark. `None` for a PNG, JPEG or WebP image.
     ///
     /// # Errors
     /// As for [`Self::image`] and [`AssetDir::unusable_image`].

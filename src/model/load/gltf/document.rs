@@ -26,7 +26,7 @@ pub(super) struct Document {
     pub(super) images: Vec<Image>,
     pub(super) samplers: Vec<Sampler>,
     pub(super) animations: Vec<IgnoredAny>,
-    pub(super) skins: Vec<IgnoredAny>,
+    pub(super) skins: Vec<Skin>,
     pub(super) cameras: Vec<IgnoredAny>,
 }
 
@@ -49,6 +49,7 @@ pub(super) struct Node {
     pub(super) name: Option<String>,
     pub(super) children: Vec<usize>,
     pub(super) mesh: Option<usize>,
+    pub(super) skin: Option<usize>,
     /// Column-major 4x4; mutually exclusive with translation, rotation and scale.
     pub(super) matrix: Option<[f64; 16]>,
     pub(super) translation: Option<[f64; 3]>,
@@ -56,6 +57,17 @@ pub(super) struct Node {
     pub(super) rotation: Option<[f64; 4]>,
     pub(super) scale: Option<[f64; 3]>,
     pub(super) weights: Option<Vec<f32>>,
+}
+
+/// The joints of a skinned mesh.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Skin {
+    /// Nodes.
+    pub(super) joints: Vec<usize>,
+    /// Accessor with a matrix per joint; the identity if it is missing.
+    #[serde(default)]
+    pub(super) inverse_bind_matrices: Option<usize>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -153,7 +165,29 @@ pub(super) struct Image {
 #[serde(default)]
 pub(super) struct Texture {
     pub(super) sampler: Option<usize>,
-    pub(super) source: Option<usize>,
+    source: Option<usize>,
+    extensions: ImageExtensions,
+}
+
+impl Texture {
+    /// The index of the image: that of the extension EXT_texture_webp, if there is one.
+    pub(super) fn image(&self) -> Option<usize> {
+        self.extensions.webp.as_ref().and_then(|webp| webp.source).or(self.source)
+    }
+}
+
+/// Extensions of a texture that name an image of another format.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct ImageExtensions {
+    #[serde(rename = "EXT_texture_webp")]
+    webp: Option<ImageExtension>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct ImageExtension {
+    source: Option<usize>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -207,7 +241,7 @@ impl Default for PbrMetallicRoughness {
 pub(super) struct TextureInfo {
     pub(super) index: usize,
     #[serde(default)]
-    pub(super) tex_coord: u32,
+    tex_coord: u32,
     /// Factor of x and y of the normals; for normal textures only.
     #[serde(default)]
     pub(super) scale: Option<f32>,
@@ -218,7 +252,44 @@ pub(super) struct TextureInfo {
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct TextureExtensions {
     #[serde(default, rename = "KHR_texture_transform")]
-    pub(super) transform: Option<IgnoredAny>,
+    pub(super) transform: Option<TextureTransform>,
+}
+
+/// The extension KHR_texture_transform.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "camelCase", default)]
+pub(super) struct TextureTransform {
+    pub(super) offset: [f32; 2],
+    /// In radians.
+    pub(super) rotation: f32,
+    pub(super) scale: [f32; 2],
+    tex_coord: Option<u32>,
+}
+
+impl Default for TextureTransform {
+    fn default() -> Self {
+        Self { offset: [0.0; 2], rotation: 0.0, scale: [1.0; 2], tex_coord: None }
+    }
+}
+
+impl TextureTransform {
+    /// Texture coordinates after the transform: translation x rotation x scale.
+    pub(super) fn apply(&self, [u, v]: [f32; 2]) -> [f32; 2] {
+        let (sin, cos) = self.rotation.sin_cos();
+        let (u, v) = (u * self.scale[0], v * self.scale[1]);
+        [cos * u + sin * v + self.offset[0], cos * v - sin * u + self.offset[1]]
+    }
+}
+
+impl TextureInfo {
+    /// The set of texture coordinates, which KHR_texture_transform can replace.
+    pub(super) fn uv_set(&self) -> u32 {
+        self.extensions.transform.and_then(|transform| transform.tex_coord).unwrap_or(self.tex_coord)
+    }
+
+    pub(super) fn transform(&self) -> TextureTransform {
+        self.extensions.transform.unwrap_or_default()
+    }
 }
 
 /// The value of OpenGL's `GL_TRIANGLES`.

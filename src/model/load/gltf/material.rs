@@ -17,13 +17,15 @@
 
 use std::collections::HashMap;
 
-use super::document::{self, Document};
+use super::document::{self, Document, TextureInfo, TextureTransform};
 use super::get_element;
-use super::primitive::PrimitiveColors;
 use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
-use crate::domain::{AlphaMode, Material};
-use crate::error::{Result, invalid};
+use crate::domain::{AlphaMode, Material, Mesh};
+use crate::error::Result;
+use crate::load::obj::DEFAULT_ALPHA_CUTOFF;
+use crate::load::polygons::{VertexColors, paint, paint_over, patch_side};
+use crate::load::values::CorrectedValue;
 
 /// Converts materials when primitives first use them.
 #[derive(Debug)]
@@ -51,33 +53,68 @@ impl<'a> MaterialConverter<'a> {
         let Some(index) = material else { return Ok(0) };
         let material = get_element(&self.document.materials, index, "material")?;
         let base_color_texture = material.pbr_metallic_roughness.base_color_texture.as_ref();
-        Ok(base_color_texture.or(material.normal_texture.as_ref()).map_or(0, |texture| texture.tex_coord))
+        Ok(base_color_texture.or(material.normal_texture.as_ref()).map_or(0, TextureInfo::uv_set))
     }
 
-    /// Whether a material has an image that texture coordinates place on the surface.
+    /// The transform of the texture coordinates of a material: that of its base color texture or, without this texture, that
+    /// of its normal map.
     ///
     /// # Errors
     /// `Invalid` if the material does not exist.
-    pub(super) fn has_image(&self, material: Option<usize>) -> Result<bool> {
-        let Some(index) = material else { return Ok(false) };
+    pub(super) fn uv_transform(&self, material: Option<usize>) -> Result<TextureTransform> {
+        let Some(index) = material else { return Ok(TextureTransform::default()) };
         let material = get_element(&self.document.materials, index, "material")?;
-        Ok(material.pbr_metallic_roughness.base_color_texture.is_some() || material.normal_texture.is_some())
+        let base_color_texture = material.pbr_metallic_roughness.base_color_texture.as_ref();
+        Ok(base_color_texture.or(material.normal_texture.as_ref()).map(TextureInfo::transform).unwrap_or_default())
     }
 
-    /// Adds a copy of a converted material that has the colors of a primitive's vertices, and returns its index. Returns
-    /// `index`, the index of the original, if the vertices have no colors.
-    pub(super) fn with_vertex_colors(&mut self, index: usize, colors: PrimitiveColors) -> usize {
+    /// Applies the colors of a primitive's vertices: adds a copy of the material that has them, and returns the mesh and the
+    /// index of this copy. The colors multiply those of the material and its image. An opaque material ignores their alpha.
+    ///
+    /// # Errors
+    /// As for [`paint`], and `Invalid` or `OutOfMemory` if the image of the colors exceeds the memory.
+    pub(super) fn with_vertex_colors(
+        &mut self,
+        index: usize,
+        mesh: Mesh,
+        mut colors: Vec<[f32; 4]>,
+        remarks: &mut ImportRemarks,
+    ) -> Result<(Mesh, usize)> {
         let mut material = self.materials[index].clone();
-        match colors {
-            PrimitiveColors::None => return index,
-            PrimitiveColors::Uniform(color) => material.multiply_color(color),
-            PrimitiveColors::Image(texture) => {
-                material.color_texture = Some(self.texture_loader.textures.len());
-                self.texture_loader.textures.push(texture);
-            }
+        if material.alpha_mode == AlphaMode::Opaque {
+            colors.iter_mut().for_each(|color| color[3] = 1.0);
         }
+        let [first, others @ ..] = &colors[..] else { return Ok((mesh, index)) };
+        let is_uniform = others.iter().all(|color| color == first);
+        let mesh = match material.color_texture {
+            _ if is_uniform => {
+                let [red, green, blue, alpha] = *first;
+                material.multiply_color([red, green, blue]);
+                material.alpha *= alpha;
+                mesh
+            }
+            // The image of the colors has texture coordinates of its own.
+            _ if material.normal_texture.is_some() => {
+                remarks.add("vertex colors are not used where the material has a normal map".into());
+                return Ok((mesh, index));
+            }
+            Some(image) => {
+                let side = patch_side(&mesh, &self.texture_loader.textures[image])?;
+                self.texture_loader.charge_patches(side, mesh.triangles().len())?;
+                let (mesh, texture) = paint_over(&mesh, &colors, &self.texture_loader.textures[image], side)?;
+                material.color_texture = Some(self.texture_loader.add(texture));
+                mesh
+            }
+            None => {
+                self.texture_loader.charge_patches(2, mesh.triangles().len())?;
+                let VertexColors::Image(painted) = paint(&mesh, &colors)? else { return Ok((mesh, index)) };
+                let (mesh, texture) = *painted;
+                material.color_texture = Some(self.texture_loader.add(texture));
+                mesh
+            }
+        };
         self.materials.push(material);
-        self.materials.len() - 1
+        Ok((mesh, self.materials.len() - 1))
     }
 
     /// Returns the index of a converted material. The first call for a material converts it. `material` is its index in
@@ -118,17 +155,24 @@ impl<'a> MaterialConverter<'a> {
         let name = source.name.as_deref().filter(|name| !name.is_empty());
         let name = name.map_or_else(|| format!("material {index}"), |name| sanitize(name, 120));
         let pbr = &source.pbr_metallic_roughness;
-        check_factors(pbr)?;
+        let mut factor = |field: &str, value: f32| {
+            let subject = format!("material '{name}': {field}");
+            remarks.corrections.in_range(&subject, value, [0.0, 1.0], "1 is used").unwrap_or(1.0)
+        };
+        let [red, green, blue, alpha] = pbr.base_color_factor.map(|value| factor("baseColorFactor", value));
+        let (metalness, roughness) =
+            (factor("metallicFactor", pbr.metallic_factor), factor("roughnessFactor", pbr.roughness_factor));
+        let cutoff = source.alpha_cutoff.map_or(DEFAULT_ALPHA_CUTOFF, |cutoff| factor("alphaCutoff", cutoff));
         let color_texture = self.load_base_color(pbr, &name, has_uvs, remarks)?;
         let normal_texture = self.load_normal_map(source, &name, has_uvs, remarks)?;
-        let (metalness, roughness) = self.mean_metalness_and_roughness(pbr, &name, remarks)?;
+        let [metalness_mean, roughness_mean] = self.mean_metalness_and_roughness(pbr, &name, remarks)?;
+        let (metalness, roughness) = (metalness * metalness_mean, roughness * roughness_mean);
         if source.occlusion_texture.is_some() {
             remarks.add(format!("material '{name}': the occlusion texture is ignored"));
         }
         if source.emissive_texture.is_some() || source.emissive_factor.is_some_and(|color| color != [0.0; 3]) {
             remarks.add(format!("material '{name}': emission is ignored"));
         }
-        let [red, green, blue, alpha] = pbr.base_color_factor;
         let base_color = [red, green, blue];
         // alpha^2 of the GGX distribution; the minimum prevents a division by 0.
         let alpha2 = roughness.powi(4).max(1e-8);
@@ -141,7 +185,7 @@ impl<'a> MaterialConverter<'a> {
             alpha,
             color_texture,
             normal_texture,
-            alpha_mode: convert_alpha_mode(source)?,
+            alpha_mode: convert_alpha_mode(source, cutoff, &name, remarks),
             double_sided: source.double_sided,
             name,
         }
@@ -157,7 +201,7 @@ impl<'a> MaterialConverter<'a> {
     ) -> Result<Option<usize>> {
         let Some(texture) = &pbr.base_color_texture else { return Ok(None) };
         if !has_uvs {
-            let uv_set = texture.tex_coord;
+            let uv_set = texture.uv_set();
             remarks
                 .add(format!("material '{name}': the color texture is ignored: a primitive lacks TEXCOORD_{uv_set}"));
             return Ok(None);
@@ -179,12 +223,15 @@ impl<'a> MaterialConverter<'a> {
     ) -> Result<Option<usize>> {
         let Some(texture) = &source.normal_texture else { return Ok(None) };
         let base_color_texture = source.pbr_metallic_roughness.base_color_texture.as_ref();
-        let has_other_uv_set = base_color_texture.is_some_and(|base_color| base_color.tex_coord != texture.tex_coord);
+        let has_other_uv_set = base_color_texture.is_some_and(|base_color| base_color.uv_set() != texture.uv_set());
         if has_other_uv_set || !has_uvs {
             let reason = if has_other_uv_set { "the color texture does not use" } else { "a primitive lacks" };
-            let uv_set = texture.tex_coord;
+            let uv_set = texture.uv_set();
             remarks.add(format!("material '{name}': the normal map is ignored: {reason} TEXCOORD_{uv_set}"));
             return Ok(None);
+        }
+        if base_color_texture.is_some_and(|base_color| base_color.transform() != texture.transform()) {
+            remarks.add(format!("material '{name}': the normal map has the texture transform of the color texture"));
         }
         if let Some(scale) = texture.scale.filter(|scale| *scale != 1.0) {
             remarks.add(format!("material '{name}': the normal map's scale of {scale} is ignored"));
@@ -196,24 +243,23 @@ impl<'a> MaterialConverter<'a> {
         self.texture_loader.texture_index(texture, remarks).map(Some).map_err(prefix_with("normalTexture"))
     }
 
-    /// Mean metalness and roughness, 0 to 1. The texture contains metalness in blue and roughness in green.
+    /// Means of the factors of metalness and roughness in the texture, 0 to 1. The texture contains metalness in blue and roughness in green.
     fn mean_metalness_and_roughness(
         &mut self,
         pbr: &document::PbrMetallicRoughness,
         name: &str,
         remarks: &mut ImportRemarks,
-    ) -> Result<(f32, f32)> {
-        let (metalness, roughness) = (pbr.metallic_factor, pbr.roughness_factor);
-        let Some(texture) = &pbr.metallic_roughness_texture else { return Ok((metalness, roughness)) };
+    ) -> Result<[f32; 2]> {
+        let Some(texture) = &pbr.metallic_roughness_texture else { return Ok([1.0; 2]) };
         let with_field = prefix_with("pbrMetallicRoughness.metallicRoughnessTexture");
         let stand_in = "the metallic and roughness factors are used";
         if self.texture_loader.is_unusable(texture, stand_in, remarks).map_err(&with_field)? {
-            return Ok((metalness, roughness));
+            return Ok([1.0; 2]);
         }
         let channel_means = self.texture_loader.channel_means(texture, remarks).map_err(with_field)?;
         remarks.add(format!("material '{name}': only the mean of the metallic-roughness texture is used"));
         let [_, green, blue, _] = channel_means;
-        Ok((metalness * blue, roughness * green))
+        Ok([blue, green])
     }
 }
 
@@ -221,27 +267,16 @@ fn prefix_with(field: &str) -> impl Fn(crate::error::Error) -> crate::error::Err
     move |error| error.prefix_field(field)
 }
 
-fn check_factors(pbr: &document::PbrMetallicRoughness) -> Result<()> {
-    let [red, green, blue, alpha] = pbr.base_color_factor;
-    let factors = [
-        ("baseColorFactor[0]", red),
-        ("baseColorFactor[1]", green),
-        ("baseColorFactor[2]", blue),
-        ("baseColorFactor[3]", alpha),
-        ("metallicFactor", pbr.metallic_factor),
-        ("roughnessFactor", pbr.roughness_factor),
-    ];
-    match factors.into_iter().find(|(_, factor)| !(0.0..=1.0).contains(factor)) {
-        None => Ok(()),
-        Some((field, factor)) => Err(invalid(format!("pbrMetallicRoughness.{field}"), "0 to 1", factor)),
-    }
-}
-
-fn convert_alpha_mode(source: &document::Material) -> Result<AlphaMode> {
+fn convert_alpha_mode(source: &document::Material, cutoff: f32, name: &str, remarks: &mut ImportRemarks) -> AlphaMode {
     match source.alpha_mode.as_deref() {
-        None | Some("OPAQUE") => Ok(AlphaMode::Opaque),
-        Some("BLEND") => Ok(AlphaMode::Blend),
-        Some("MASK") => Ok(AlphaMode::Mask { cutoff: source.alpha_cutoff.unwrap_or(0.5) }),
-        Some(other) => Err(invalid("alphaMode", "OPAQUE, MASK or BLEND", sanitize(other, 40))),
+        None | Some("OPAQUE") => AlphaMode::Opaque,
+        Some("BLEND") => AlphaMode::Blend,
+        Some("MASK") => AlphaMode::Mask { cutoff },
+        Some(other) => {
+            let subject = format!("material '{name}': alphaMode");
+            let value = || CorrectedValue::new("", "OPAQUE, MASK or BLEND", sanitize(other, 40));
+            remarks.corrections.add(&subject, "OPAQUE is used", value);
+            AlphaMode::Opaque
+        }
     }
 }

@@ -10,10 +10,12 @@ mod assemble;
 mod buffers;
 mod container;
 mod document;
+mod extensions;
 mod hierarchy;
 mod material;
 mod primitive;
 mod remarks;
+mod skin;
 #[cfg(test)]
 mod tests;
 mod texture;
@@ -30,11 +32,6 @@ use remarks::ImportRemarks;
 
 /// The largest file in bytes: the model itself, or a buffer or image next to it.
 const MAX_FILE_BYTES: u64 = 1 << 29;
-
-/// Name prefixes of extensions that affect only the appearance of surfaces and lights. The geometry is correct without
-/// them.
-const APPEARANCE_EXTENSION_PREFIXES: [&str; 4] =
-    ["KHR_materials_", "KHR_texture_transform", "KHR_lights_punctual", "KHR_xmp"];
 
 /// Reads the glTF or GLB file `path`. Its buffers and images must be in the file itself or in or below its folder.
 ///
@@ -56,7 +53,7 @@ fn parse(folder: &AssetDir, name: &str, content: &[u8], crease_angle: CreaseAngl
     let document = container::parse_document(container.json)?;
     let mut remarks = ImportRemarks::default();
     check_version(&document)?;
-    check_extensions(&document, &mut remarks)?;
+    extensions::check(&document, folder.is_strict(), name, &mut remarks)?;
     report_ignored_features(&document, &mut remarks);
     let buffers = GltfBuffers::load(&document, folder, container.bin)?;
     assemble::assemble(name, &document, &buffers, crease_angle, remarks)
@@ -72,25 +69,9 @@ fn check_version(document: &document::Document) -> Result<()> {
     Err(invalid("asset.version", "2.0", remarks::sanitize(&given, 80)))
 }
 
-fn check_extensions(document: &document::Document, remarks: &mut ImportRemarks) -> Result<()> {
-    let affects_only_appearance =
-        |name: &str| APPEARANCE_EXTENSION_PREFIXES.iter().any(|prefix| name.starts_with(prefix));
-    for (index, name) in document.extensions_required.iter().enumerate() {
-        if !affects_only_appearance(name) {
-            let field = format!("extensionsRequired[{index}]");
-            return Err(invalid(field, "no extension that changes geometry", name));
-        }
-    }
-    for name in document.extensions_used.iter().chain(&document.extensions_required) {
-        remarks.add(format!("the extension {name} is not supported: ignored"));
-    }
-    Ok(())
-}
-
 fn report_ignored_features(document: &document::Document, remarks: &mut ImportRemarks) {
     for (count, feature, reason) in [
         (document.animations.len(), "animations", "simulations provide the motion"),
-        (document.skins.len(), "skins", "meshes keep their bind pose"),
         (document.cameras.len(), "cameras", "clients provide the cameras"),
     ] {
         if count > 0 {

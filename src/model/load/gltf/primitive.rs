@@ -2,12 +2,15 @@
 //! from the POSITION targets. A vertex has one corner, or one per normal if the primitive has no NORMAL and creases
 //! split it.
 
-use super::accessor::{AccessorReader, AttributeFormat};
-use super::document::Primitive;
+use nalgebra::Matrix4;
+
+use super::accessor::{AccessorReader, AttributeFormat, ComponentTypes};
+use super::document::{Primitive, TextureTransform};
 use super::remarks::ImportRemarks;
-use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, Texture, split_at_creases};
+use super::skin::Pose;
+use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, split_at_creases};
 use crate::error::{Result, invalid};
-use crate::load::polygons::{VertexColors, paint};
+use crate::load::values::CorrectedValue;
 
 /// Values of [`Primitive::mode`]; lower values are points and lines.
 const TRIANGLES: u64 = 4;
@@ -16,31 +19,25 @@ const FAN: u64 = 6;
 
 /// What the conversion of a primitive depends on besides the primitive.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct PrimitiveOptions {
+pub(super) struct PrimitiveOptions<'a> {
     /// The set of texture coordinates that the material uses.
     pub(super) uv_set: u32,
-    /// Whether the material has an image.
-    pub(super) has_image: bool,
+    /// The transform of the texture coordinates.
+    pub(super) uv_transform: TextureTransform,
     pub(super) crease_angle: CreaseAngle,
+    /// The matrices of the joints, if the node has a skin.
+    pub(super) joint_matrices: Option<&'a [Matrix4<f64>]>,
 }
 
-/// A primitive as a shape, and the colors of its vertices as factors of its material.
+/// The mesh and the modes of a primitive, and the colors of its vertices as factors of its material.
 #[derive(Debug)]
 pub(super) struct ConvertedPrimitive {
-    pub(super) shape: Shape,
-    pub(super) colors: PrimitiveColors,
-    /// Whether the primitive has texture coordinates for the images of its material.
-    pub(super) has_uvs: bool,
-}
-
-/// The colors of the vertices of a primitive.
-#[derive(Debug)]
-pub(super) enum PrimitiveColors {
-    None,
-    /// All vertices have this linear color.
-    Uniform([f32; 3]),
-    /// The texture coordinates of the shape refer to this image.
-    Image(Texture),
+    pub(super) mesh: Mesh,
+    pub(super) modes: Modes,
+    /// Linear colors of the vertices with alpha, 0 to 1; empty if they have none.
+    pub(super) colors: Vec<[f32; 4]>,
+    /// Whether a morph target has normals.
+    pub(super) has_target_normals: bool,
 }
 
 /// Converts a primitive to a shape, with the texture coordinates of its material if the primitive has them. Returns
@@ -51,7 +48,7 @@ pub(super) enum PrimitiveColors {
 pub(super) fn convert_primitive(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
-    options: PrimitiveOptions,
+    options: PrimitiveOptions<'_>,
     remarks: &mut ImportRemarks,
 ) -> Result<Option<ConvertedPrimitive>> {
     if primitive.mode > FAN {
@@ -63,72 +60,61 @@ pub(super) fn convert_primitive(
     }
     let position_accessor = primitive.attributes.get("POSITION");
     let position_accessor = *position_accessor.ok_or_else(|| invalid("attributes.POSITION", "an accessor", "none"))?;
-    let format = AttributeFormat { allows_integers: false, count: None };
-    let rest_positions = reader
+    let format = AttributeFormat { components: ComponentTypes::Quantized, count: None };
+    let mut rest_positions = reader
         .decode_vectors::<3>(position_accessor, format)
         .map_err(|error| error.prefix_field("attributes.POSITION"))?;
-    let modes = read_modes(reader, primitive, rest_positions.len(), remarks)?;
-    let mesh = read_mesh(reader, primitive, rest_positions, options)?;
-    let has_uvs = !mesh.corners().uvs.is_empty();
-    let (mesh, colors) = match primitive.attributes.get("COLOR_0") {
-        None => (mesh, PrimitiveColors::None),
-        // The colors are drawn through texture coordinates of their own.
-        Some(_) if options.has_image && has_uvs => {
-            remarks.add("vertex colors are not used where the material has an image".into());
-            (mesh, PrimitiveColors::None)
-        }
+    let vertex_count = rest_positions.len();
+    let pose = match options.joint_matrices {
+        Some(matrices) => Some(Pose::read(reader, primitive, matrices, vertex_count)?),
+        None => None,
+    };
+    if let Some(pose) = &pose {
+        pose.move_positions(&mut rest_positions);
+    }
+    let modes = read_modes(reader, primitive, vertex_count, pose.as_ref(), remarks)?;
+    let mesh = read_mesh(reader, primitive, rest_positions, (options, pose.as_ref()), remarks)?;
+    let colors = match primitive.attributes.get("COLOR_0") {
+        None => Vec::new(),
         Some(accessor) => {
-            let colors = read_colors(reader, *accessor, mesh.rest_positions().len(), remarks);
-            let colors = colors.map_err(|error| error.prefix_field("attributes.COLOR_0"))?;
-            color_vertices(reader, mesh, &colors)?
+            let colors = read_colors(reader, *accessor, vertex_count, remarks);
+            colors.map_err(|error| error.prefix_field("attributes.COLOR_0"))?
         }
     };
-    Ok(Some(ConvertedPrimitive { shape: Shape::new(mesh, modes)?, colors, has_uvs }))
+    let has_target_normals = primitive.targets.iter().any(|target| target.contains_key("NORMAL"));
+    Ok(Some(ConvertedPrimitive { mesh, modes, colors, has_target_normals }))
 }
 
-/// The linear colors of the vertices. Their alpha is ignored.
+/// The linear colors of the vertices with alpha.
 fn read_colors(
     reader: AccessorReader<'_>,
     accessor: usize,
     vertex_count: usize,
     remarks: &mut ImportRemarks,
-) -> Result<Vec<[f32; 3]>> {
-    let format = AttributeFormat { allows_integers: true, count: Some(vertex_count) };
-    let clamp = |channel: f32| channel.clamp(0.0, 1.0);
-    if reader.document.accessors.get(accessor).is_none_or(|accessor| accessor.kind != "VEC4") {
-        let colors = reader.decode_vectors::<3>(accessor, format)?;
-        return Ok(colors.into_iter().map(|color| color.map(clamp)).collect());
-    }
-    let colors = reader.decode_vectors::<4>(accessor, format)?;
-    if colors.iter().any(|color| color[3] < 1.0) {
-        remarks.add("the alpha of vertex colors is ignored".into());
-    }
-    Ok(colors.into_iter().map(|[red, green, blue, _]| [red, green, blue].map(clamp)).collect())
-}
-
-/// Colors the vertices of a mesh.
-fn color_vertices(
-    reader: AccessorReader<'_>,
-    mesh: Mesh,
-    linear_colors: &[[f32; 3]],
-) -> Result<(Mesh, PrimitiveColors)> {
-    // Four texels per triangle.
-    reader.buffers.charge_budget(16 * mesh.triangles().len() as u64)?;
-    Ok(match paint(&mesh, linear_colors)? {
-        VertexColors::Uniform(color) => (mesh, PrimitiveColors::Uniform(color)),
-        VertexColors::Image(painted) => {
-            let (mesh, texture) = *painted;
-            (mesh, PrimitiveColors::Image(texture))
-        }
-    })
+) -> Result<Vec<[f32; 4]>> {
+    let format = AttributeFormat { components: ComponentTypes::UnitInterval, count: Some(vertex_count) };
+    let has_alpha = reader.document.accessors.get(accessor).is_some_and(|accessor| accessor.kind == "VEC4");
+    let (mut colors, alphas): (Vec<[f32; 3]>, Vec<f32>) = if has_alpha {
+        let colors = reader.decode_vectors::<4>(accessor, format)?;
+        colors.into_iter().map(|[red, green, blue, alpha]| ([red, green, blue], alpha)).unzip()
+    } else {
+        (reader.decode_vectors::<3>(accessor, format)?, vec![1.0; vertex_count])
+    };
+    remarks.corrections.vertex_colors(&mut colors, 0);
+    let mut alpha_in_range =
+        |alpha: f32| remarks.corrections.in_range("alpha of a vertex", alpha, [0.0, 1.0], "1 is used").unwrap_or(1.0);
+    let colors = colors.into_iter().zip(alphas);
+    Ok(colors.map(|([red, green, blue], alpha)| [red, green, blue, alpha_in_range(alpha)]).collect())
 }
 
 fn read_mesh(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
-    rest_positions: Vec<[f32; 3]>,
-    PrimitiveOptions { uv_set, crease_angle, .. }: PrimitiveOptions,
+    mut rest_positions: Vec<[f32; 3]>,
+    (options, pose): (PrimitiveOptions<'_>, Option<&Pose>),
+    remarks: &mut ImportRemarks,
 ) -> Result<Mesh> {
+    let PrimitiveOptions { uv_set, crease_angle, uv_transform, .. } = options;
     let indices = match primitive.indices {
         Some(accessor) => {
             reader.decode_indices(accessor, rest_positions.len()).map_err(|error| error.prefix_field("indices"))?
@@ -139,29 +125,58 @@ fn read_mesh(
     let max_triangles = if primitive.mode == TRIANGLES { indices.len() / 3 } else { indices.len() };
     reader.buffers.reserve_mesh(rest_positions.len(), max_triangles)?;
     let triangles = build_triangles(&indices, primitive.mode)?;
-    let format = AttributeFormat { allows_integers: false, count: Some(rest_positions.len()) };
-    let normals = match primitive.attributes.get("NORMAL") {
+    check_positions(&mut rest_positions, &triangles, remarks)?;
+    let format = AttributeFormat { components: ComponentTypes::Quantized, count: Some(rest_positions.len()) };
+    let mut normals = match primitive.attributes.get("NORMAL") {
         Some(accessor) => {
-            Some(reader.decode_vectors(*accessor, format).map_err(|error| error.prefix_field("attributes.NORMAL"))?)
+            reader.decode_vectors::<3>(*accessor, format).map_err(|error| error.prefix_field("attributes.NORMAL"))?
         }
-        None => None,
+        None => Vec::new(),
     };
+    if let Some(pose) = pose {
+        pose.move_normals(&mut normals);
+    }
+    remarks.corrections.zero_non_finite("attributes.NORMAL", "the normal is computed", &mut normals, 0);
     let attribute = format!("TEXCOORD_{uv_set}");
-    let format = AttributeFormat { allows_integers: true, ..format };
-    let uvs: Vec<[f32; 2]> = match primitive.attributes.get(&attribute) {
+    let mut uvs: Vec<[f32; 2]> = match primitive.attributes.get(&attribute) {
         Some(accessor) => reader
             .decode_vectors(*accessor, format)
             .map_err(|error| error.prefix_field(&format!("attributes.{attribute}")))?,
         None => Vec::new(),
     };
-    if let Some(normals) = normals {
+    if uv_transform != TextureTransform::default() {
+        uvs.iter_mut().for_each(|uv| *uv = uv_transform.apply(*uv));
+    }
+    remarks.corrections.zero_non_finite(&format!("attributes.{attribute}"), "(0, 0) is used", &mut uvs, 0);
+    let file_normals: Vec<Option<[f32; 3]>> =
+        normals.iter().map(|normal| Some(*normal).filter(|normal| *normal != [0.0; 3])).collect();
+    if !normals.is_empty() && file_normals.iter().all(Option::is_some) {
         return Mesh::from_indexed(rest_positions, normals, uvs, triangles);
     }
     let vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
-    let creased = split_at_creases(&rest_positions, &vertices, &triangles, &[], crease_angle);
+    let creased = split_at_creases(&rest_positions, &vertices, &triangles, &file_normals, crease_angle);
     let uvs = creased.source_corners.iter().filter_map(|vertex| uvs.get(*vertex as usize).copied()).collect();
     let corners = Corners { vertices: creased.source_corners, normals: creased.normals, uvs };
     Mesh::new(rest_positions, corners, creased.triangles)
+}
+
+/// Checks that the positions of all triangles are finite, and replaces those of other vertices.
+fn check_positions(positions: &mut [[f32; 3]], triangles: &[[u32; 3]], remarks: &mut ImportRemarks) -> Result<()> {
+    let is_finite = |position: &[f32; 3]| position.iter().all(|number| number.is_finite());
+    if positions.iter().all(is_finite) {
+        return Ok(());
+    }
+    if let Some(vertex) = triangles.as_flattened().iter().find(|vertex| !is_finite(&positions[**vertex as usize])) {
+        let given = format!("{:?}", positions[*vertex as usize]);
+        return Err(invalid(format!("attributes.POSITION: element {vertex}"), "finite numbers", given));
+    }
+    let used_position = triangles.first().map_or([0.0; 3], |triangle| positions[triangle[0] as usize]);
+    for (vertex, position) in positions.iter_mut().enumerate().filter(|(_, position)| !is_finite(position)) {
+        let value = || CorrectedValue::new(format!("element {vertex}"), "finite numbers", format!("{position:?}"));
+        remarks.corrections.add("attributes.POSITION", "no triangle uses the vertex", value);
+        *position = used_position;
+    }
+    Ok(())
 }
 
 /// The triangles of a list, strip or fan. The degenerate triangles that connect strips are omitted.
@@ -193,6 +208,7 @@ fn read_modes(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
     vertex_count: usize,
+    pose: Option<&Pose>,
     remarks: &mut ImportRemarks,
 ) -> Result<Modes> {
     let targets = &primitive.targets;
@@ -202,19 +218,25 @@ fn read_modes(
     let mut columns = Vec::new();
     for (index, target) in targets.iter().enumerate() {
         for attribute in target.keys().filter(|attribute| *attribute != "POSITION") {
-            remarks.add(match attribute.as_str() {
-                "NORMAL" | "TANGENT" => {
-                    format!("{attribute} targets are ignored: normals follow the displaced surface")
-                }
-                _ => format!("{attribute} targets are ignored"),
-            });
+            // Exact normals replace the normals and tangents of targets.
+            if !matches!(attribute.as_str(), "NORMAL" | "TANGENT") {
+                remarks.add(format!("{attribute} targets are ignored"));
+            }
         }
-        let format = AttributeFormat { allows_integers: false, count: Some(vertex_count) };
+        let format = AttributeFormat { components: ComponentTypes::Quantized, count: Some(vertex_count) };
         let column = match target.get("POSITION") {
             Some(accessor) => reader.decode_vectors::<3>(*accessor, format),
             None => reader.buffers.charge_budget(12 * vertex_count as u64).map(|()| vec![[0.0; 3]; vertex_count]),
         };
-        let column = column.map_err(|error| error.prefix_field(&format!("targets[{index}].POSITION")))?;
+        let in_target = |error: crate::error::Error| error.prefix_field(&format!("targets[{index}].POSITION"));
+        let mut column = column.map_err(in_target)?;
+        if let Some(vertex) = column.iter().position(|entry| entry.iter().any(|number| !number.is_finite())) {
+            let given = format!("{:?}", column[vertex]);
+            return Err(in_target(invalid(format!("element {vertex}"), "finite numbers", given)));
+        }
+        if let Some(pose) = pose {
+            pose.move_displacements(&mut column);
+        }
         columns.extend_from_slice(column.as_flattened());
     }
     Ok(Modes::from_columns(3 * vertex_count, targets.len(), columns)?.without_zero_matrix())

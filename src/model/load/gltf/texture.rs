@@ -30,7 +30,7 @@ impl<'a> TextureLoader<'a> {
     /// Returns the index of a texture. The first call for an image decodes it.
     ///
     /// # Errors
-    /// `Invalid` if the texture does not exist or is not a PNG or JPEG image.
+    /// `Invalid` if the texture does not exist or is not a PNG, JPEG or WebP image.
     pub(super) fn texture_index(&mut self, texture_info: &TextureInfo, remarks: &mut ImportRemarks) -> Result<usize> {
         let image_index = self.image_index_of(texture_info, remarks)?;
         if let Some(index) = self.texture_indices.get(&image_index) {
@@ -42,11 +42,27 @@ impl<'a> TextureLoader<'a> {
         Ok(self.textures.len() - 1)
     }
 
-    /// Whether a texture has no PNG or JPEG image: its image is a file that does not exist, has another format, or is
+    /// Adds a texture that no image of the document has, and returns its index.
+    pub(super) fn add(&mut self, texture: Texture) -> usize {
+        self.textures.push(texture);
+        self.textures.len() - 1
+    }
+
+    /// Reserves the memory of an image with a patch of `side` x `side` texels per triangle.
+    ///
+    /// # Errors
+    /// As for [`GltfBuffers::charge_budget`].
+    pub(super) fn charge_patches(&self, side: usize, triangle_count: usize) -> Result<()> {
+        // The last row of patches can be incomplete.
+        let patches = triangle_count as u64 + (triangle_count as f64).sqrt().ceil() as u64;
+        self.buffers.charge_budget(4 * (side as u64).pow(2) * patches)
+    }
+
+    /// Whether a texture has no PNG, JPEG or WebP image: its image is a file that does not exist, has another format, or is
     /// defined by an extension. Adds a remark that ends with `stand_in`.
     ///
     /// # Errors
-    /// `Invalid` if the texture does not exist and, in strict mode, if it has no PNG or JPEG image.
+    /// `Invalid` if the texture does not exist and, in strict mode, if it has no PNG, JPEG or WebP image.
     pub(super) fn is_unusable(
         &self,
         texture_info: &TextureInfo,
@@ -54,8 +70,8 @@ impl<'a> TextureLoader<'a> {
         remarks: &mut ImportRemarks,
     ) -> Result<bool> {
         let texture = get_element(&self.document.textures, texture_info.index, "index")?;
-        if texture.source.is_none() && !self.buffers.is_strict() {
-            remarks.add(format!("texture {} has no PNG or JPEG image: {stand_in}", texture_info.index));
+        if texture.image().is_none() && !self.buffers.is_strict() {
+            remarks.add(format!("texture {} has no PNG, JPEG or WebP image: {stand_in}", texture_info.index));
             return Ok(true);
         }
         let image = self.image_index_of(texture_info, remarks)?;
@@ -101,11 +117,8 @@ impl<'a> TextureLoader<'a> {
                 remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
             }
         }
-        if texture_info.extensions.transform.is_some() {
-            remarks.add("KHR_texture_transform is not supported: texture coordinates remain unchanged".into());
-        }
         let image_index =
-            texture.source.ok_or_else(|| invalid(format!("{texture_field}.source"), "an image", "none"))?;
+            texture.image().ok_or_else(|| invalid(format!("{texture_field}.source"), "an image", "none"))?;
         get_element(&self.document.images, image_index, &format!("{texture_field}.source"))?;
         Ok(image_index)
     }

@@ -13,7 +13,7 @@ use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
 use crate::load::surface::{ModelOptions, ModesSource};
 use crate::load::{modes, source, texture_cache};
-use crate::scene::{MAX_DOMAINS, PresetRequest, SceneParts, UpAxis};
+use crate::scene::{MAX_DOMAINS, NormalMethod, PresetRequest, SceneParts, UpAxis};
 
 /// Number of parent vertices that carry the domains of an entry without `parent_vertices`.
 const DEFAULT_ATTACHMENT_VERTICES: usize = 8;
@@ -56,7 +56,7 @@ pub(super) fn assemble(
         Some(keys) => keys.render_settings(),
         None => parts.look.with_preset(PresetRequest::default()),
     };
-    parts.deformation = manifest.deform.deformation_settings();
+    parts.deformation = manifest.deform.deformation_settings(parts.deformation.normals);
     match manifest.shadows {
         Some(false) => parts.look.shadow = None,
         Some(true) => parts.look.shadow = Some(parts.look.shadow.unwrap_or_default()),
@@ -169,6 +169,9 @@ impl ManifestAssembler<'_> {
         }
         if entry_index == 0 {
             (self.parts.up, self.parts.unit, self.parts.look) = (model.up, model.unit, model.look);
+        }
+        if model.deformation.normals == NormalMethod::Exact {
+            self.parts.deformation.normals = NormalMethod::Exact;
         }
         let up = self.manifest.up.unwrap_or(self.parts.up);
         if entry.up.is_none() && model.up != up {

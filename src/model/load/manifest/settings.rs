@@ -149,7 +149,7 @@ impl LookKeys {
 #[serde(default, deny_unknown_fields)]
 pub(super) struct DeformKeys {
     storage: StorageType,
-    normals: NormalMethod,
+    normals: Option<NormalMethod>,
     compensated: bool,
     displacements: bool,
     boxes: bool,
@@ -158,11 +158,11 @@ pub(super) struct DeformKeys {
 }
 
 impl DeformKeys {
-    /// The settings of the scene.
-    pub(super) fn deformation_settings(&self) -> DeformationSettings {
+    /// The settings of the scene. `normals` is the method that the models choose.
+    pub(super) fn deformation_settings(&self, normals: NormalMethod) -> DeformationSettings {
         DeformationSettings {
             storage: self.storage,
-            normals: self.normals,
+            normals: self.normals.unwrap_or(normals),
             compensated: self.compensated,
             displacements: self.displacements,
             boxes: self.boxes,

@@ -32,19 +32,18 @@ pub(in crate::load) struct NpyHeader {
 /// The largest length of a header with its magic, version and length.
 pub(in crate::load) const MAX_PREFIX_BYTES: usize = MAX_HEADER_BYTES + 12;
 
-/// Parses an array of f32 or f64 (rounded to f32) in either byte order.
+/// Parses an array of whole or floating-point numbers (rounded to f32) in either byte order.
 ///
 /// # Errors
 /// `Invalid` if the header or the type is not supported, or if the size of the data does not match the shape.
 pub fn parse(bytes: &[u8]) -> Result<NpyArray> {
     let (header, body) = parse_header(bytes)?;
     header.check_size(body)?;
-    let entries = match header.dtype.as_str() {
-        "<f4" => super::vega::read_f32_le(body),
-        "<f8" => super::vega::read_f64_le_as_f32(body),
-        ">f4" => body.as_chunks().0.iter().map(|entry| f32::from_be_bytes(*entry)).collect(),
-        ">f8" => body.as_chunks().0.iter().map(|entry| f64::from_be_bytes(*entry) as f32).collect(),
-        other => return Err(invalid("descr", "f4 or f8", other)),
+    let (kind, body) = in_little_endian(&header.dtype, body);
+    let entries = match kind {
+        "f4" => super::vega::read_f32_le(&body),
+        "f8" => super::vega::read_f64_le_as_f32(&body),
+        _ => entries_of_kind(kind, &body, |entry| entry as f32).ok_or_else(|| unknown_type(&header.dtype))?,
     };
     Ok(NpyArray { shape: header.shape, fortran_order: header.fortran_order, entries })
 }
@@ -61,21 +60,7 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
         return Err(invalid("fortran_order", "False for more than two axes", "True"));
     }
     let (kind, body) = in_little_endian(&header.dtype, body);
-    let body = &*body;
-    let entries: Vec<f64> = match kind {
-        "u1" | "b1" => body.iter().map(|entry| f64::from(*entry)).collect(),
-        "i1" => body.iter().map(|entry| f64::from(i8::from_le_bytes([*entry]))).collect(),
-        "i2" => body.as_chunks().0.iter().map(|entry| f64::from(i16::from_le_bytes(*entry))).collect(),
-        "u2" => body.as_chunks().0.iter().map(|entry| f64::from(u16::from_le_bytes(*entry))).collect(),
-        "i4" => body.as_chunks().0.iter().map(|entry| f64::from(i32::from_le_bytes(*entry))).collect(),
-        "u4" => body.as_chunks().0.iter().map(|entry| f64::from(u32::from_le_bytes(*entry))).collect(),
-        // Whole numbers above 2^53 are rounded. No valid index is as large.
-        "i8" => body.as_chunks().0.iter().map(|entry| i64::from_le_bytes(*entry) as f64).collect(),
-        "u8" => body.as_chunks().0.iter().map(|entry| u64::from_le_bytes(*entry) as f64).collect(),
-        "f4" => body.as_chunks().0.iter().map(|entry| f64::from(f32::from_le_bytes(*entry))).collect(),
-        "f8" => body.as_chunks().0.iter().map(|entry| f64::from_le_bytes(*entry)).collect(),
-        _ => return Err(invalid("descr", "i1, u1, i2, u2, i4, u4, i8, u8, f4 or f8", header.dtype)),
-    };
+    let entries = entries_of_kind(kind, &body, |entry| entry).ok_or_else(|| unknown_type(&header.dtype))?;
     let entries = match header.shape[..] {
         [rows, columns] if header.fortran_order => {
             (0..rows * columns).map(|index| entries[index % columns * rows + index / columns]).collect()
@@ -83,6 +68,46 @@ pub(in crate::load) fn parse_f64(bytes: &[u8]) -> Result<(Vec<usize>, Vec<f64>)>
         _ => entries,
     };
     Ok((header.shape, entries))
+}
+
+fn unknown_type(dtype: &str) -> Error {
+    invalid("descr", "i1, u1, i2, u2, i4, u4, i8, u8, f2, f4 or f8", dtype)
+}
+
+/// Converts little-endian entries of a type such as `f4`. `None` for an unknown type.
+pub(super) fn entries_of_kind<T>(kind: &str, body: &[u8], convert: impl Fn(f64) -> T) -> Option<Vec<T>> {
+    Some(match kind {
+        "u1" | "b1" => body.iter().map(|entry| convert(f64::from(*entry))).collect(),
+        "i1" => body.iter().map(|entry| convert(f64::from(i8::from_le_bytes([*entry])))).collect(),
+        "i2" => body.as_chunks().0.iter().map(|entry| convert(f64::from(i16::from_le_bytes(*entry)))).collect(),
+        "u2" => body.as_chunks().0.iter().map(|entry| convert(f64::from(u16::from_le_bytes(*entry)))).collect(),
+        "i4" => body.as_chunks().0.iter().map(|entry| convert(f64::from(i32::from_le_bytes(*entry)))).collect(),
+        "u4" => body.as_chunks().0.iter().map(|entry| convert(f64::from(u32::from_le_bytes(*entry)))).collect(),
+        // Whole numbers above 2^53 are rounded. No valid index is as large.
+        "i8" => body.as_chunks().0.iter().map(|entry| convert(i64::from_le_bytes(*entry) as f64)).collect(),
+        "u8" => body.as_chunks().0.iter().map(|entry| convert(u64::from_le_bytes(*entry) as f64)).collect(),
+        "f2" => {
+            let entries = body.as_chunks().0.iter();
+            entries.map(|entry| convert(f64::from(f16_to_f32(u16::from_le_bytes(*entry))))).collect()
+        }
+        "f4" => body.as_chunks().0.iter().map(|entry| convert(f64::from(f32::from_le_bytes(*entry)))).collect(),
+        "f8" => body.as_chunks().0.iter().map(|entry| convert(f64::from_le_bytes(*entry))).collect(),
+        _ => return None,
+    })
+}
+
+/// IEEE 754 binary16 to f32, exact. A binary16 has a sign bit, 5 exponent bits with bias 15, and 10 fraction bits. The
+/// fraction is read as a whole number, so the exponent of 2 is `exponent` - 15 - 10.
+pub(super) fn f16_to_f32(bits: u16) -> f32 {
+    let sign = if bits & 0x8000 == 0 { 1.0 } else { -1.0 };
+    let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f32::from(bits & 0x3ff));
+    let magnitude = match exponent {
+        0 => fraction * 2f32.powi(-24),
+        31 if fraction == 0.0 => f32::INFINITY,
+        31 => f32::NAN,
+        _ => (1024.0 + fraction) * 2f32.powi(exponent - 25),
+    };
+    sign * magnitude
 }
 
 /// The entries of an array of bytes.
@@ -126,7 +151,7 @@ pub(in crate::load) fn parse_header(bytes: &[u8]) -> Result<(NpyHeader, &[u8])> 
         Some("i2" | "u2" | "f2") => 2,
         Some("f4" | "i4" | "u4") => 4,
         Some("f8" | "i8" | "u8") => 8,
-        _ => return Err(invalid("descr", "f4 or f8", dtype)),
+        _ => return Err(unknown_type(&dtype)),
     };
     let data_bytes = shape.iter().try_fold(entry_bytes, |size: usize, extent| size.checked_mul(*extent));
     let data_bytes = data_bytes
@@ -214,7 +239,30 @@ mod tests {
         let row_major = ndarray::Array2::from_shape_fn((3, 2), entry);
         let column_major = ndarray::Array2::from_shape_fn((3, 2).f(), entry);
         let f64_array = row_major.mapv(f64::from);
-        let modes: Vec<_> = [to_npy(&row_major), to_npy(&column_major), to_npy(&f64_array)]
+        // binary16 and big-endian entries, which the crate ndarray-npy does not write.
+        let with_entries = |dtype: &str, entries: Vec<u8>| {
+            let header = format!("{{'descr': '{dtype}', 'fortran_order': False, 'shape': (3, 2)}}");
+            let mut bytes = npy_file(&header, 0);
+            bytes.extend(entries);
+            bytes
+        };
+        let f16_bits = [0_u16, 0x3c00, 0x4000, 0x4200, 0x4400, 0x4500];
+        let f16_file = with_entries("<f2", f16_bits.iter().flat_map(|bits| bits.to_le_bytes()).collect());
+        let big_endian = with_entries(">f2", f16_bits.iter().flat_map(|bits| bits.to_be_bytes()).collect());
+        let files = [
+            to_npy(&row_major),
+            to_npy(&column_major),
+            to_npy(&f64_array),
+            f16_file,
+            big_endian,
+            to_npy(&row_major.mapv(|entry| entry as i8)),
+            to_npy(&row_major.mapv(|entry| entry as u16)),
+            to_npy(&row_major.mapv(|entry| entry as i64)),
+        ];
+        for file in &files {
+            assert_eq!(parse_f64(file).expect("a valid .npy file").1, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]);
+        }
+        let modes: Vec<_> = files
             .iter()
             .map(|bytes| super::super::matrix(parse(bytes).expect("a valid .npy file")).expect("a matrix"))
             .collect();
@@ -223,8 +271,7 @@ mod tests {
             parse(&to_npy(&column_major)).expect("a valid .npy file").fortran_order,
             "control: expected a column-major file"
         );
-        assert_eq!(modes[0], modes[1]);
-        assert_eq!(modes[0], modes[2]);
+        assert!(modes.iter().all(|other| *other == modes[0]), "{modes:?}");
     }
 
     fn npy_file(header: &str, data_bytes: usize) -> Vec<u8> {
@@ -249,8 +296,8 @@ mod tests {
             (file_with_shape("(3, -1)"), "shape: expected a tuple of whole numbers"),
             (file_with_shape(&brackets), "header: expected the key 'shape'"),
             (
-                npy_file("{'descr': '<i4', 'fortran_order': False, 'shape': (3,1)}", 12),
-                "descr: expected f4 or f8, got <i4",
+                npy_file("{'descr': '<c8', 'fortran_order': False, 'shape': (3,1)}", 24),
+                "descr: expected i1, u1, i2, u2, i4, u4, i8, u8, f2, f4 or f8, got <c8",
             ),
             (npy_file("{'descr': '<f4', 'fortran_order': No, 'shape': (3,1)}", 12), "fortran_order: expected"),
             (npy_file("{}", 0), "header: expected the key 'descr'"),

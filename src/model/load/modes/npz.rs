@@ -321,11 +321,12 @@ pub(in crate::load) mod tests {
 
     #[test]
     fn hostile_archives_are_rejected_before_their_data_are_read() {
-        let header = |shape: &str| {
-            let text = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}");
+        let typed_header = |dtype: &str, shape: &str| {
+            let text = format!("{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}");
             let length = u16::try_from(text.len()).expect("a short header").to_le_bytes();
             [b"\x93NUMPY\x01\x00", &length[..], text.as_bytes()].concat()
         };
+        let header = |shape: &str| typed_header("<f4", shape);
         let deflated = |bytes: Vec<u8>| archive(&[("U", bytes)], CompressionMethod::Deflated);
         let valid = deflated(npy(&ndarray::arr2(&[[1.0_f32], [2.0], [3.0]])));
         for length in 0..valid.len() {
@@ -339,7 +340,7 @@ pub(in crate::load) mod tests {
             (deflated([header("(3, 513)"), vec![0; 4 * 3 * 513]].concat()), "array 'U': shape: expected at most 512"),
             (deflated([header("(4, 1)"), vec![0; 16]].concat()), "array 'U': modes.rows"),
             (deflated(npy(&ndarray::arr2(&[[f32::NAN], [0.0], [0.0]]))), "array 'U': modes[0, 0]: expected a finite"),
-            (deflated(npy(&ndarray::arr2(&[[1_i32], [0], [0]]))), "array 'U': descr: expected f4 or f8, got <i4"),
+            (deflated([typed_header("<c8", "(3, 1)"), vec![0; 24]].concat()), "array 'U': descr: expected i1, u1, i2"),
         ] {
             let message = read(&bytes).expect_err(start).to_string();
             assert!(message.starts_with(start), "{message}");

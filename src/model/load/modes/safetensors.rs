@@ -1,9 +1,10 @@
 //! Parser of safetensors files. U is the tensor named `U` or the only tensor of the file, row-major, as f64, f32, f16
-//! or bf16. The tensor `eigenvalues` (f64 or f32) is optional.
+//! bf16 or whole numbers. The tensor `eigenvalues` (f64 or f32) is optional.
 
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
+use super::npy::entries_of_kind;
 use super::{LoadedModes, NpyArray, matrix};
 use crate::error::{Result, invalid};
 
@@ -44,16 +45,29 @@ pub(super) fn parse(bytes: &[u8]) -> Result<LoadedModes> {
 
 fn read_entries(tensor: &TensorView<'_>, name: &str) -> Result<Vec<f32>> {
     let body = tensor.data();
-    Ok(match tensor.dtype() {
-        Dtype::F64 => super::vega::read_f64_le_as_f32(body),
-        Dtype::F32 => super::vega::read_f32_le(body),
-        Dtype::F16 => body.as_chunks().0.iter().map(|bits| f16_to_f32(u16::from_le_bytes(*bits))).collect(),
+    let kind = match tensor.dtype() {
+        Dtype::F64 => return Ok(super::vega::read_f64_le_as_f32(body)),
+        Dtype::F32 => return Ok(super::vega::read_f32_le(body)),
         // bf16 is the upper half of an f32.
         Dtype::BF16 => {
             let bf16_to_f32 = |bits: &[u8; 2]| f32::from_bits(u32::from(u16::from_le_bytes(*bits)) << 16);
-            body.as_chunks().0.iter().map(bf16_to_f32).collect()
+            return Ok(body.as_chunks().0.iter().map(bf16_to_f32).collect());
         }
-        other => return Err(invalid(format!("tensor '{name}': type"), "F64, F32, F16 or BF16", format!("{other:?}"))),
+        Dtype::F16 => "f2",
+        Dtype::I8 => "i1",
+        Dtype::U8 => "u1",
+        Dtype::I16 => "i2",
+        Dtype::U16 => "u2",
+        Dtype::I32 => "i4",
+        Dtype::U32 => "u4",
+        Dtype::I64 => "i8",
+        Dtype::U64 => "u8",
+        _ => "",
+    };
+    let entries = entries_of_kind(kind, body, |entry| entry as f32);
+    entries.ok_or_else(|| {
+        let field = format!("tensor '{name}': type");
+        invalid(field, "F64, F32, F16, BF16 or whole numbers", format!("{:?}", tensor.dtype()))
     })
 }
 
@@ -67,24 +81,11 @@ fn read_eigenvalues(tensor: &TensorView<'_>) -> Result<Vec<f64>> {
     }
 }
 
-/// IEEE 754 binary16 to f32, exact. A binary16 has a sign bit, 5 exponent bits with bias 15, and 10 fraction bits. The
-/// fraction is read as a whole number, so the exponent of 2 is `exponent` - 15 - 10.
-fn f16_to_f32(bits: u16) -> f32 {
-    let sign = if bits & 0x8000 == 0 { 1.0 } else { -1.0 };
-    let (exponent, fraction) = (i32::from(bits >> 10 & 0x1f), f32::from(bits & 0x3ff));
-    let magnitude = match exponent {
-        0 => fraction * 2f32.powi(-24),
-        31 if fraction == 0.0 => f32::INFINITY,
-        31 => f32::NAN,
-        _ => (1024.0 + fraction) * 2f32.powi(exponent - 25),
-    };
-    sign * magnitude
-}
-
 #[cfg(test)]
 mod tests {
     use safetensors::tensor::TensorView;
 
+    use super::super::npy::f16_to_f32;
     use super::*;
 
     /// A file with tensors, each with its name, type, shape and data. Leaks a copy of the data, so that the tensor
@@ -107,6 +108,9 @@ mod tests {
         // 1, -0.5 and 2 as binary16, then as bfloat16.
         let f16s: Vec<u8> = [0x3c00u16, 0xb800, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
         let bf16s: Vec<u8> = [0x3f80u16, 0xbf00, 0x4000].iter().flat_map(|entry| entry.to_le_bytes()).collect();
+        let whole =
+            parse(&serialize_tensors(&[("anything", Dtype::I8, vec![3, 1], &[1, 255, 2])])).expect("a valid file");
+        assert_eq!(whole.modes.column(0), [1.0, -1.0, 2.0]);
         for (dtype, body) in [(Dtype::F64, f64s), (Dtype::F32, f32s), (Dtype::F16, f16s), (Dtype::BF16, bf16s)] {
             let modes =
                 parse(&serialize_tensors(&[("anything", dtype, vec![3, 1], &body)])).expect("a valid file").modes;
@@ -146,7 +150,7 @@ mod tests {
                 serialize_tensors(&[("a", Dtype::F32, vec![3, 1], &zeros[..]), two_tensors[1].clone()]),
                 "tensor: expected one tensor, or one named U",
             ),
-            (serialize_tensors(&[("U", Dtype::I32, vec![3, 1], &zeros[..])]), "tensor 'U': type"),
+            (serialize_tensors(&[("U", Dtype::BOOL, vec![12, 1], &zeros[..])]), "tensor 'U': type"),
             (serialize_tensors(&[("U", Dtype::F32, vec![3], &zeros[..])]), "tensor 'U': shape"),
             (serialize_tensors(&[("U", Dtype::F32, vec![1, 3], &zeros[..])]), "modes.rows"),
             (vec![255; 64], "header: expected a safetensors file"),

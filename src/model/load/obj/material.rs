@@ -18,7 +18,7 @@ pub(in crate::load) const DEFAULT_ALPHA_CUTOFF: f32 = 0.5;
 ///
 /// # Errors
 /// `Invalid` with the material and the statement: an unreadable file. In strict mode, also a missing image, an image that is
-/// neither PNG nor JPEG, and the corrections of [`crate::load::values`], which are remarks otherwise.
+/// no PNG, JPEG or WebP image, and the corrections of [`crate::load::values`], which are remarks otherwise.
 pub(super) fn create_material(
     name: &str,
     statements: &MtlMaterial,
@@ -76,7 +76,7 @@ pub(super) fn create_material(
     material.validated()
 }
 
-/// Removes the images that do not exist or are neither PNG nor JPEG images, with a remark for each.
+/// Removes the images that do not exist or are no PNG, JPEG or WebP images, with a remark for each.
 ///
 /// # Errors
 /// `Invalid` with the statement and the file: for an unreadable file and, in strict mode, for any such image.
@@ -264,10 +264,13 @@ mod tests {
             let material = create_material("m", &statements["m"], &files, &mut texture_cache, &mut remarks);
             let material = material.expect("a material without the image");
             assert_eq!((material.color_texture, material.normal_texture), (None, None));
-            let expected = format!("material 'm': {field} 'a.tga' is neither a PNG nor a JPEG image: {stand_in}");
+            let expected = format!("material 'm': {field} 'a.tga' is no PNG, JPEG or WebP image: {stand_in}");
             assert_eq!(remarks, [expected]);
             let message = read(&text, folder.path()).expect_err(statement).to_string();
-            assert!(message.ends_with("expected a PNG or JPEG image, got another format (strict mode)"), "{message}");
+            assert!(
+                message.ends_with("expected a PNG, JPEG or WebP image, got another format (strict mode)"),
+                "{message}"
+            );
         }
     }
 
@@ -277,7 +280,10 @@ mod tests {
         std::fs::write(folder.path().join("broken.png"), b"\x89PNG\r\n\x1a\n").expect("a writable file");
         for (statement, start) in [
             ("map_Kd no.png", "material 'm': map_Kd: file 'no.png': expected an existing file, got none (strict mode)"),
-            ("map_Kd broken.png", "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG or JPEG image"),
+            (
+                "map_Kd broken.png",
+                "material 'm': map_Kd, map_d: texture 'broken.png': expected a PNG, JPEG or WebP image",
+            ),
             ("norm no.png", "material 'm': normal map: file 'no.png': expected an existing file"),
             ("d 7", "material 'm': d: expected 0 to 1, got 7 (strict mode)"),
             ("Ns nan", "material 'm': Ns: expected 0 to 1000000, got NaN (strict mode)"),

@@ -40,10 +40,10 @@ pub(super) fn parse(bytes: &[u8]) -> Result<BTreeMap<String, MtlMaterial>> {
         let Some(key) = words(line).next() else { continue };
         if key == b"newmtl" {
             materials.extend(current.replace((text_after_key(line), MtlMaterial::default())));
-        } else if let Some((name, statements)) = &mut current {
-            if let Err(error) = statements.parse_statement(key, line, name) {
-                statements.ignore_statement(key, index + 1, name, error)?;
-            }
+        } else if let Some((name, statements)) = &mut current
+            && let Err(error) = statements.parse_statement(key, line, name)
+        {
+            statements.ignore_statement(key, index + 1, name, error)?;
         }
     }
     materials.extend(current);

@@ -353,11 +353,11 @@ mod tests {
             ("f 1 2 3/0", "index of vt: expected 1 to 0 or -0 to -1, got 0 (line 4: f): the index is ignored"),
             (
                 "vn nan 0 1\nf 1//1 2//1 3//1",
-                "normal: expected finite numbers, got [NaN, 0.0, 1.0] (normal 1): the normal is computed",
+                "normal: expected finite numbers, got [NaN, 0.0, 1.0] (element 1): the normal is computed",
             ),
             (
                 "vt 0 inf\nf 1/1 2/1 3/1",
-                "texture coordinates: expected finite numbers, got [0.0, -inf] (texture coordinates 1): (0, 0) is used",
+                "texture coordinates: expected finite numbers, got [0.0, -inf] (element 1): (0, 0) is used",
             ),
             (
                 "v 0 -nan 0\nf 1 2 3",

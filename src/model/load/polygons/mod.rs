@@ -6,7 +6,7 @@ mod triangulate;
 mod vertex_colors;
 
 pub(super) use build::{build_all_faces, build_faces};
-pub(super) use vertex_colors::{VertexColors, linear_from_srgb, paint};
+pub(super) use vertex_colors::{VertexColors, linear_from_srgb, paint, paint_over, patch_side};
 
 use super::values::{CorrectedValue, Corrections};
 use crate::error::{Result, invalid};

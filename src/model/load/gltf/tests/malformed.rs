@@ -71,7 +71,7 @@ fn out_of_range_numbers_are_rejected_by_field() {
         ("/accessors/0/byteOffset", json!(4), "accessors[0]: byteOffset"),
         ("/accessors/0/bufferView", json!(99), "accessors[0]: bufferView"),
         ("/accessors/0/bufferView", json!(null), "accessors[0]: bufferView"),
-        ("/accessors/0/componentType", json!(5122), "accessors[0]: componentType"),
+        ("/accessors/0/componentType", json!(5125), "accessors[0]: componentType"),
         ("/accessors/0/type", json!("VEC4"), "accessors[0]: type"),
         ("/accessors/3/count", json!(two_to_62), "indices: accessors[3]: byteOffset"),
         ("/accessors/3/count", json!(two_to_63), "indices: accessors[3]: count"),
@@ -94,10 +94,6 @@ fn out_of_range_numbers_are_rejected_by_field() {
         ("/bufferViews/0/byteStride", json!(0), "accessors[0]: bufferView.byteStride"),
         ("/bufferViews/0/byteStride", json!(u64_max), "accessors[0]: byteOffset"),
         ("/buffers/0/byteLength", json!(1_u64 << 40), "buffers[0]: byteLength"),
-        ("/materials/0/pbrMetallicRoughness/baseColorFactor", json!([1, 1, 1, 7]), "baseColorFactor[3]"),
-        ("/materials/0/pbrMetallicRoughness/roughnessFactor", json!(-0.5), "roughnessFactor"),
-        ("/materials/0/alphaCutoff", json!(3), "cutoff"),
-        ("/materials/0/alphaMode", json!("GHOST"), "materials[0]: alphaMode"),
         ("/meshes/0/weights", json!([1]), "nodes[0]: weights"),
         ("/nodes/0/rotation", json!([0, 0, 0, 0]), "nodes[0]: rotation"),
         ("/nodes/0/matrix", json!([1, 0, 0, 1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "nodes[0]: matrix"),
@@ -156,10 +152,10 @@ fn invalid_indices_and_non_finite_numbers_are_rejected() {
     for invalid_number in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut model = morphed_triangle();
         model.bin[16..20].copy_from_slice(&invalid_number.to_le_bytes());
-        assert_rejected(&model, "mesh.positions[1]");
+        assert_rejected(&model, "attributes.POSITION: element 1");
         let mut model = morphed_triangle();
         model.bin[36..40].copy_from_slice(&invalid_number.to_le_bytes());
-        assert_rejected(&model, "modes[0, 0]");
+        assert_rejected(&model, "targets[0].POSITION: element 0");
     }
     let mut model = complete_model();
     let view = model.add_view(&[2, 0]);
@@ -287,4 +283,36 @@ fn image_beyond_the_size_limit_is_rejected() {
     let mut model = complete_model();
     let view = model.add_view(&large_png);
     assert_rejected(&model.with("/images/0/bufferView", json!(view)), "images[0]: texture 'swatch'");
+}
+
+/// Values of materials that do not prevent a picture.
+#[test]
+fn values_out_of_range_are_remarks_but_errors_in_strict_mode() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = crate::load::asset_dir::AssetDir::unrestricted(folder.path()).strict();
+    for (pointer, value, remark) in [
+        (
+            "/materials/0/pbrMetallicRoughness/baseColorFactor",
+            json!([1, 1, 1, 7]),
+            Some("baseColorFactor: expected 0 to 1, got 7"),
+        ),
+        ("/materials/0/pbrMetallicRoughness/baseColorFactor", json!([1.000_000_2, 1, 1, 1]), None),
+        (
+            "/materials/0/pbrMetallicRoughness/roughnessFactor",
+            json!(-0.5),
+            Some("roughnessFactor: expected 0 to 1, got -0.5"),
+        ),
+        ("/materials/0/alphaCutoff", json!(3), Some("alphaCutoff: expected 0 to 1, got 3")),
+        ("/materials/0/alphaMode", json!("GHOST"), Some("alphaMode: expected OPAQUE, MASK or BLEND, got GHOST")),
+    ] {
+        let model = complete_model().with(pointer, value);
+        let remarks = model.parts().remarks;
+        let found = remark.is_some_and(|remark| remarks.iter().any(|given| given.contains(remark)));
+        assert_eq!(found, remark.is_some(), "expected {remark:?}, got {remarks:?}");
+        let strict = super::super::parse(&files, "model", &model.to_glb(), CreaseAngle::default()).map(drop);
+        match remark {
+            Some(remark) => assert!(strict.expect_err(pointer).to_string().contains(remark)),
+            None => strict.expect("a valid model"),
+        }
+    }
 }

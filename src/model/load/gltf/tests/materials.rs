@@ -62,7 +62,7 @@ fn missing_images_are_remarks_but_errors_in_strict_mode() {
     assert!(message.ends_with("file 'absent.png': expected an existing file, got none (strict mode)"), "{message}");
 }
 
-/// Covers images of other formats than PNG and JPEG: embedded, as a data URI, and defined by an extension only.
+/// Covers images of other formats than PNG, JPEG and WebP: embedded, as a data URI, and defined by an extension only.
 #[test]
 fn other_image_formats_are_remarks_but_errors_in_strict_mode() {
     let pbr = json!({
@@ -70,26 +70,26 @@ fn other_image_formats_are_remarks_but_errors_in_strict_mode() {
     });
     let model = || textured_triangle(json!({"pbrMetallicRoughness": pbr}));
     let mut embedded = model();
-    let view = embedded.add_view(b"RIFF\x10\0\0\0WEBPVP8L");
-    embedded.json["images"] = json!([{"name": "swatch", "bufferView": view, "mimeType": "image/webp"}]);
+    let view = embedded.add_view(b"\xabKTX 20\xbb\r\n\x1a\n\0\0\0\0");
+    embedded.json["images"] = json!([{"name": "swatch", "bufferView": view, "mimeType": "image/ktx2"}]);
     let mut data_uri = model();
     data_uri.json["images"] = json!([{"name": "swatch", "uri": "data:image/bmp;base64,Qk02AAAAAAAAADYAAAAoAAAA"}]);
     let mut extension = model();
-    extension.json["textures"] = json!([{"extensions": {"EXT_texture_webp": {"source": 0}}}]);
+    extension.json["textures"] = json!([{"extensions": {"KHR_texture_basisu": {"source": 0}}}]);
     let folder = tempfile::tempdir().expect("a temporary folder");
     let files = crate::load::asset_dir::AssetDir::unrestricted(folder.path()).strict();
     for (model, remark, error) in [
         (
             embedded,
-            "image 'swatch' is neither a PNG nor a JPEG image: the color factor is drawn",
-            "a PNG or JPEG image",
+            "image 'swatch' is no PNG, JPEG or WebP image: the color factor is drawn",
+            "a PNG, JPEG or WebP image",
         ),
         (
             data_uri,
-            "image 'swatch' is neither a PNG nor a JPEG image: the color factor is drawn",
-            "a PNG or JPEG image",
+            "image 'swatch' is no PNG, JPEG or WebP image: the color factor is drawn",
+            "a PNG, JPEG or WebP image",
         ),
-        (extension, "texture 0 has no PNG or JPEG image: the color factor is drawn", "textures[0].source"),
+        (extension, "texture 0 has no PNG, JPEG or WebP image: the color factor is drawn", "textures[0].source"),
     ] {
         let parts = model.parts();
         assert_eq!((parts.materials[0].diffuse, parts.materials[0].color_texture), ([0.5, 0.25, 0.125], None));
@@ -115,31 +115,35 @@ fn vertex_colors_of_all_formats_are_drawn() {
     let floats: Vec<u8> = bytemuck::cast_slice(&[1.0_f32, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 7.0]).to_vec();
     let bytes = [255_u8, 0, 0, 255, 0, 255, 0, 255, 0, 0, 255, 128];
     let shorts = bytes.map(|byte| u16::from(byte) * 257);
-    for (data, component, kind, has_alpha) in [
-        (&floats[..], super::F32, "VEC3", false),
-        (&bytes, super::U8, "VEC4", true),
-        (bytemuck::cast_slice(&shorts), super::U16, "VEC4", true),
+    for (data, component, kind) in [
+        (&floats[..], super::F32, "VEC3"),
+        (&bytes, super::U8, "VEC4"),
+        (bytemuck::cast_slice(&shorts), super::U16, "VEC4"),
     ] {
-        let mut model = Model::triangle();
-        let colors = model.add_accessor(data, component, kind, 3);
-        model.json["accessors"][colors]["normalized"] = (component != super::F32).into();
-        model.primitive()["attributes"]["COLOR_0"] = colors.into();
-        model.primitive()["material"] = 0.into();
-        model.json["materials"] = json!([{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.5, 0.5, 1.0]}}]);
-        let parts = model.parts();
-        let texels = [0, 1, 2].map(|corner| texel_at_corner(&parts, corner));
-        assert_eq!(texels, [[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255]], "{kind} of {component}");
-        let ambient = parts.materials[parts.domains[0].material].ambient;
-        assert_eq!(ambient, [0.5; 3], "expected the colors to multiply the color of the material");
-        let has_alpha_remark = parts.remarks.iter().any(|remark| remark == "the alpha of vertex colors is ignored");
-        assert_eq!(has_alpha_remark, has_alpha);
-        Scene::new(parts).expect("a valid scene");
+        for (alpha_mode, alpha) in [("OPAQUE", 255), ("BLEND", if kind == "VEC4" { 128 } else { 255 })] {
+            let mut model = Model::triangle();
+            let colors = model.add_accessor(data, component, kind, 3);
+            model.json["accessors"][colors]["normalized"] = (component != super::F32).into();
+            model.primitive()["attributes"]["COLOR_0"] = colors.into();
+            model.primitive()["material"] = 0.into();
+            let pbr = json!({"baseColorFactor": [0.5, 0.5, 0.5, 1.0]});
+            model.json["materials"] = json!([{"pbrMetallicRoughness": pbr, "alphaMode": alpha_mode}]);
+            let parts = model.parts();
+            let texels = [0, 1, 2].map(|corner| texel_at_corner(&parts, corner));
+            let expected = [[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, alpha]];
+            assert_eq!(texels, expected, "{kind} of {component}, {alpha_mode}");
+            let ambient = parts.materials[parts.domains[0].material].ambient;
+            assert_eq!(ambient, [0.5; 3], "expected the colors to multiply the color of the material");
+            let is_clamped = parts.remarks.iter().any(|remark| remark.contains("the channels are clamped"));
+            assert_eq!(is_clamped, component == super::F32, "{:?}", parts.remarks);
+            Scene::new(parts).expect("a valid scene");
+        }
     }
 }
 
-/// Covers one color for all vertices, and vertex colors in a primitive whose material has an image.
+/// Covers one color for all vertices, and vertex colors in a primitive whose material has an image or a normal map.
 #[test]
-fn equal_vertex_colors_are_factors_and_images_have_precedence() {
+fn vertex_colors_multiply_factors_and_images() {
     let with_colors = |mut model: Model, colors: &[f32]| {
         let accessor = model.add_floats("VEC3", 3, colors);
         model.primitive()["attributes"]["COLOR_0"] = accessor.into();
@@ -153,9 +157,17 @@ fn equal_vertex_colors_are_factors_and_images_have_precedence() {
     let parts = with_colors(uniform, &[0.5, 1.0, 0.25].repeat(3)).parts();
     let material = &parts.materials[parts.domains[0].material];
     assert_eq!((material.diffuse, material.color_texture), ([0.25, 0.5, 0.25], None));
-    let textured = textured_triangle(json!({"pbrMetallicRoughness": pbr}));
-    let parts = with_colors(textured, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]).parts();
-    assert_eq!((parts.textures.len(), parts.textures[0].name.as_str()), (1, "swatch"));
+    let textured = || textured_triangle(json!({"pbrMetallicRoughness": pbr}));
+    // The image has the color (0, 128, 255).
+    let parts = with_colors(textured(), &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]).parts();
+    let texels = [0, 1, 2].map(|corner| texel_at_corner(&parts, corner));
+    assert_eq!(texels, [[0, 0, 0, 255], [0, 128, 0, 255], [0, 0, 255, 255]]);
+    let parts = with_colors(textured(), &[0.5, 1.0, 0.25].repeat(3)).parts();
+    let material = &parts.materials[parts.domains[0].material];
+    assert_eq!((material.diffuse, parts.textures.len()), ([0.25, 0.5, 0.25], 1), "expected the image and a factor");
+    let normal_map = textured_triangle(json!({"pbrMetallicRoughness": pbr, "normalTexture": {"index": 0}}));
+    let parts = with_colors(normal_map, &[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]).parts();
+    assert_eq!(texel_at_corner(&parts, 0), [0, 128, 255, 255]);
     assert!(parts.remarks.iter().any(|remark| remark.starts_with("vertex colors are not used")), "{:?}", parts.remarks);
 }
 
@@ -271,14 +283,41 @@ fn primitive_without_uvs_has_a_material_without_textures() {
 }
 
 #[test]
-fn occlusion_emission_and_texture_transforms_are_reported() {
-    let transformed_texture = json!({"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}});
+fn occlusion_and_emission_are_reported_and_texture_transforms_applied() {
+    let transform = json!({"offset": [0, 1], "rotation": std::f64::consts::FRAC_PI_2, "scale": [0.5, 0.5]});
+    let transformed_texture = json!({"index": 0, "extensions": {"KHR_texture_transform": transform}});
     let source = json!({
         "name": "all", "occlusionTexture": {"index": 0}, "emissiveFactor": [0, 1, 0],
         "pbrMetallicRoughness": {"baseColorTexture": transformed_texture}
     });
-    let remarks = textured_triangle(source).parts().remarks;
-    for text in ["KHR_texture_transform", "'all': the occlusion texture", "'all': emission"] {
+    let parts = textured_triangle(source).parts();
+    // The example of the specification: the quarter at the lower left, turned by 90 degrees.
+    let uvs = &parts.shapes[0].mesh.corners().uvs;
+    for (uv, expected) in uvs.iter().zip([[0.0, 1.0], [0.0, 0.5], [0.5, 1.0]]) {
+        assert!((0..2).all(|axis| (uv[axis] - expected[axis]).abs() < 1e-6), "expected {expected:?}, got {uv:?}");
+    }
+    let remarks = parts.remarks;
+    for text in ["'all': the occlusion texture", "'all': emission"] {
         assert!(remarks.iter().any(|remark| remark.contains(text)), "expected '{text}', got {remarks:?}");
+    }
+}
+
+/// An image of the extension EXT_texture_webp, lossless and with alpha, with and without an image for other programs.
+#[test]
+fn webp_images_are_decoded() {
+    let mut bytes = Cursor::new(Vec::new());
+    let image = image::RgbaImage::from_pixel(3, 2, image::Rgba([10, 200, 30, 128]));
+    image.write_to(&mut bytes, image::ImageFormat::WebP).expect("an encoded image");
+    for fallback in [json!(0), Value::Null] {
+        let pbr = json!({"baseColorTexture": {"index": 0}});
+        let mut model = textured_triangle(json!({"pbrMetallicRoughness": pbr, "alphaMode": "BLEND"}));
+        let view = model.add_view(bytes.get_ref());
+        push(&mut model.json["images"], json!({"bufferView": view, "mimeType": "image/webp"}));
+        model.json["textures"] = json!([{"source": fallback, "extensions": {"EXT_texture_webp": {"source": 1}}}]);
+        model.json["extensionsRequired"] = json!(["EXT_texture_webp"]);
+        let parts = model.parts();
+        let texture = &parts.textures[parts.materials[0].color_texture.expect("an image")];
+        assert_eq!((texture.width(), &texture.rgba()[..4]), (3, &[10, 200, 30, 128][..]));
+        assert!(parts.remarks.is_empty(), "{:?}", parts.remarks);
     }
 }

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use crate::domain::CreaseAngle;
 use crate::error::Result;
 use crate::load::asset_dir::AssetDir;
-use crate::scene::{Scene, SceneParts};
+use crate::scene::{NormalMethod, Scene, SceneParts};
 
 // Component types of glTF.
 const U8: u64 = 5121;
@@ -129,14 +129,20 @@ fn morphed_triangle() -> Model {
 }
 
 #[test]
-fn position_targets_are_columns_of_u_and_normals_are_ignored() {
+fn position_targets_are_columns_of_u_and_normals_choose_exact_ones() {
     let parts = morphed_triangle().parts();
     let modes = &parts.shapes[0].modes;
     assert_eq!((modes.rank(), modes.vertices()), (2, 3));
     assert_eq!(modes.column(0), [0.0, 0.0, 1.0, 0.0, 0.0, 2.0, 0.0, 0.0, 3.0]);
     assert_eq!(modes.column(1), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, -0.5, 0.25]);
     assert_eq!(parts.domains[0].rest_q, [] as [f32; 0]);
-    assert!(parts.remarks.iter().any(|remark| remark.starts_with("NORMAL targets are ignored")), "{:?}", parts.remarks);
+    assert!(parts.remarks[0].starts_with("normals of morph targets: exact normals"), "{:?}", parts.remarks);
+    assert_eq!(parts.deformation.normals, NormalMethod::Exact);
+    let without_normals = morphed_triangle().with("/meshes/0/primitives/0/targets/0/NORMAL", Value::Null);
+    let mut without_normals = without_normals;
+    without_normals.primitive()["targets"][0].as_object_mut().expect("a target").remove("NORMAL");
+    let without_normals = without_normals.parts();
+    assert_eq!((without_normals.deformation.normals, without_normals.remarks.len()), (NormalMethod::Rigid, 0));
     assert_eq!(Scene::new(parts).expect("a valid scene").rank_of(0), 2);
 }
 
@@ -320,21 +326,136 @@ fn buffers_are_read_from_data_uris_and_the_model_folder_only() {
 fn unsupported_features_are_reported_or_rejected() {
     let model = Model::triangle()
         .with("/animations", json!([{"channels": [{"x": 1}]}, {}]))
-        .with("/skins", json!([{}]))
-        .with("/extensionsUsed", json!(["KHR_materials_unlit", "KHR_texture_transform"]))
-        .with("/extensionsRequired", json!(["KHR_texture_transform"]));
+        .with("/cameras", json!([{}]))
+        .with("/extensionsUsed", json!(["KHR_materials_unlit", "KHR_texture_transform", "KHR_texture_basisu"]))
+        .with("/extensionsRequired", json!(["KHR_texture_transform", "KHR_texture_basisu"]));
     let remarks = model.parts().remarks;
-    for feature in ["KHR_materials_unlit", "KHR_texture_transform", "animations (2)", "skins (1)"] {
+    for feature in ["KHR_materials_unlit", "KHR_texture_basisu", "animations (2)", "cameras (1)"] {
         assert_eq!(
             remarks.iter().filter(|remark| remark.contains(feature)).count(),
             1,
             "expected one remark on {feature}, got {remarks:?}"
         );
     }
-    for name in ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"] {
-        let message = Model::triangle().with("/extensionsRequired", json!([name])).read().expect_err(name).to_string();
-        assert!(message.starts_with("extensionsRequired[0]") && message.ends_with(name), "{message}");
+    let convert = "(convert it in its folder with `gltf-transform copy model.glb model.uncompressed.glb`";
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = AssetDir::unrestricted(folder.path());
+    let read = |name: &str, files: &AssetDir| {
+        let content = Model::triangle().with("/extensionsRequired", json!([name])).to_glb();
+        super::parse(files, "model", &content, CreaseAngle::default()).map(drop)
+    };
+    for (name, expected) in [
+        ("KHR_draco_mesh_compression", convert),
+        ("EXT_meshopt_compression", convert),
+        ("EXT_mesh_gpu_instancing", "no extension that changes geometry, got EXT_mesh_gpu_instancing"),
+        ("VENDOR_unknown", "a known extension, because others can change geometry, got VENDOR_unknown"),
+    ] {
+        let message = read(name, &files).expect_err(name).to_string();
+        assert!(message.starts_with("extensionsRequired[0]") && message.contains(expected), "{message}");
     }
+    for name in ["KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"] {
+        read(name, &files.strict()).expect("a supported extension");
+    }
+    for name in ["KHR_materials_unlit", "KHR_texture_basisu"] {
+        read(name, &files).expect("an extension that can be ignored");
+        let message = read(name, &files.strict()).expect_err("strict mode").to_string();
+        assert!(message.contains("expected an extension that is supported"), "{message}");
+    }
+}
+
+/// Positions as signed shorts in the scale of the node, and normals and texture coordinates as normalized bytes.
+#[test]
+fn quantized_attributes_are_decoded() {
+    let mut model = Model::triangle();
+    let positions = [0_i16, 0, 0, 0, 100, 0, 0, 0, 0, -100, 0, 0];
+    let positions = model.add_accessor(bytemuck::cast_slice(&positions), 5122, "VEC3", 3);
+    let normals =
+        model.add_accessor(bytemuck::cast_slice(&[0_i8, 0, -128, 0, 0, 0, 127, 0, 127, 0, 0, 0]), 5120, "VEC3", 3);
+    let uvs = model.add_accessor(&[0, 255, 0, 0, 51, 0, 0, 0, 255, 255, 0, 0], U8, "VEC2", 3);
+    for (accessor, stride) in [(positions, 8), (normals, 4), (uvs, 4)] {
+        let view = model.json["accessors"][accessor]["bufferView"].as_u64().expect("a view") as usize;
+        model.json["bufferViews"][view]["byteStride"] = stride.into();
+    }
+    for accessor in [normals, uvs] {
+        model.json["accessors"][accessor]["normalized"] = true.into();
+    }
+    model.primitive()["attributes"] = json!({"POSITION": positions, "NORMAL": normals, "TEXCOORD_0": uvs});
+    let parts = model.parts();
+    let mesh = &parts.shapes[0].mesh;
+    assert_eq!(mesh.rest_positions(), [[0.0; 3], [100.0, 0.0, 0.0], [0.0, -100.0, 0.0]]);
+    assert_eq!(mesh.corners().normals, [[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]);
+    assert_eq!(mesh.corners().uvs, [[0.0, 1.0], [0.2, 0.0], [1.0, 1.0]]);
+}
+
+/// A normal that is not a number is computed, and a position that is not a number is an error only if a triangle uses it.
+#[test]
+fn numbers_that_do_not_matter_are_remarks() {
+    let mut model = Model::triangle();
+    let normals = model.add_floats("VEC3", 3, &[0.0, 0.0, 1.0, f32::NAN, 0.0, 0.0, 0.0, 0.0, 1.0]);
+    model.primitive()["attributes"]["NORMAL"] = normals.into();
+    let parts = model.parts();
+    assert_eq!(parts.shapes[0].mesh.corners().normals, [[0.0, 0.0, 1.0]; 3]);
+    assert!(parts.remarks[0].starts_with("attributes.NORMAL: expected finite numbers"), "{:?}", parts.remarks);
+    let mut model = Model::triangle();
+    let four = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, f32::NAN, 0.0, 0.0];
+    let positions = model.add_floats("VEC3", 4, &four);
+    let indices = |last: u16| bytemuck::cast_slice::<u16, u8>(&[0, 1, last]).to_vec();
+    let used = model.add_accessor(&indices(3), U16, "SCALAR", 3);
+    let unused = model.add_accessor(&indices(2), U16, "SCALAR", 3);
+    model.primitive()["attributes"]["POSITION"] = positions.into();
+    model.primitive()["indices"] = unused.into();
+    let parts = model.parts();
+    assert!(parts.remarks[0].contains("no triangle uses the vertex"), "{:?}", parts.remarks);
+    model.primitive()["indices"] = used.into();
+    let message = model.read().expect_err("a used position").to_string();
+    assert!(message.contains("attributes.POSITION: element 3: expected finite numbers, got [NaN"), "{message}");
+}
+
+/// A mesh is drawn where its joints are. Its own node does not move it.
+#[test]
+fn skinned_meshes_have_the_pose_of_their_joints() {
+    let mut model = Model::triangle();
+    let joints = model.add_accessor(&[0, 1, 0, 0, 0, 1, 0, 0, 1, 0, 0, 0], U8, "VEC4", 3);
+    let weights = [1.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
+    let weights = model.add_floats("VEC4", 3, &weights);
+    let mut bind = [0.0_f32; 32];
+    for diagonal in [0, 5, 10, 15, 16, 21, 26, 31] {
+        bind[diagonal] = 1.0;
+    }
+    // The inverse bind matrix of the second joint moves by -5 along x.
+    bind[28] = -5.0;
+    let bind = model.add_floats("MAT4", 2, &bind);
+    let target = model.add_floats("VEC3", 3, &[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]);
+    model.primitive()["attributes"]["JOINTS_0"] = joints.into();
+    model.primitive()["attributes"]["WEIGHTS_0"] = weights.into();
+    model.primitive()["targets"] = json!([{"POSITION": target}]);
+    model.json["skins"] = json!([{"joints": [1, 2], "inverseBindMatrices": bind}]);
+    // The first joint turns by 90 degrees about z and moves by 1 along y. The second moves by 5 along x and 2 along z.
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    model.json["nodes"] = json!([
+        {"mesh": 0, "skin": 0, "translation": [100, 0, 0], "scale": [100, 100, 100]},
+        {"translation": [0, 1, 0], "rotation": [0, 0, half, half]},
+        {"translation": [5, 0, 2]}
+    ]);
+    model.json["scenes"] = json!([{"nodes": [0, 1, 2]}]);
+    let parts = model.parts();
+    assert_eq!(parts.domains[0].placement, crate::domain::Transform::IDENTITY);
+    let is_near = |given: [f32; 3], expected: [f32; 3]| (0..3).all(|axis| (given[axis] - expected[axis]).abs() < 1e-6);
+    let positions = parts.shapes[0].mesh.rest_positions();
+    for (given, expected) in positions.iter().zip([[0.0, 1.0, 0.0], [0.5, 1.0, 1.0], [0.0, 1.0, 2.0]]) {
+        assert!(is_near(*given, expected), "expected {expected:?}, got {positions:?}");
+    }
+    let column = parts.shapes[0].modes.column(0);
+    assert!(
+        is_near([column[0], column[1], column[2]], [0.0, 1.0, 0.0]),
+        "expected a turned displacement, got {column:?}"
+    );
+    assert!(is_near([column[6], column[7], column[8]], [1.0, 0.0, 0.0]), "{column:?}");
+    let rest = model.with("/nodes/0", json!({"mesh": 0})).parts();
+    assert_eq!(rest.shapes[0].mesh.rest_positions()[1], [1.0, 0.0, 0.0], "control: without a skin");
+    let missing = Model::triangle().with("/skins", json!([{"joints": [9]}])).with("/nodes/0/skin", json!(0));
+    let message = missing.read().expect_err("a missing joint").to_string();
+    assert!(message.contains("skins[0]: joints[0]: expected a node of the scene, got 9"), "{message}");
 }
 
 #[test]

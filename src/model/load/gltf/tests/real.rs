@@ -36,7 +36,7 @@ fn real_morph_stress_test_has_a_rigid_and_a_modal_domain() {
     }
     let textures: Vec<&str> = parts.textures.iter().map(|texture| texture.name.as_str()).collect();
     assert_eq!(textures, ["TinyGrid", "ColorSwatches"]);
-    for text in ["animations (3)", "NORMAL targets", "'Base': the occlusion texture"] {
+    for text in ["animations (3)", "normals of morph targets", "'Base': the occlusion texture"] {
         assert!(parts.remarks.iter().any(|remark| remark.contains(text)), "expected '{text}', got {:?}", parts.remarks);
     }
     let scene = Scene::new(parts).expect("a valid scene");
