@@ -8,7 +8,12 @@ export class FullscreenPass {
     private readonly scene = new THREE.Scene();
     private readonly camera = new THREE.Camera();
 
-    constructor(fragmentShader: string, uniforms: Record<string, unknown>) {
+    /** @param options Of the material, for example how it blends with the target. */
+    constructor(
+        fragmentShader: string,
+        uniforms: Record<string, unknown>,
+        options: THREE.ShaderMaterialParameters = {},
+    ) {
         const geometry = new THREE.BufferGeometry();
         geometry.setDrawRange(0, 3);
         const material = new THREE.RawShaderMaterial({
@@ -18,6 +23,7 @@ export class FullscreenPass {
             uniforms: Object.fromEntries(Object.entries(uniforms).map(([name, value]) => [name, { value }])),
             depthTest: false,
             depthWrite: false,
+            ...options,
         });
         this.mesh = new THREE.Mesh(geometry, material);
         this.mesh.frustumCulled = false;

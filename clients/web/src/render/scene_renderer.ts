@@ -13,6 +13,7 @@ import { FullscreenPass } from "./fullscreen_pass";
 import { fitLightBox, type Lighting, lightAxes, lightingOf, unitVector, upAxis } from "./lighting";
 import { BACKGROUND_FRAGMENT, PLAIN_FRAGMENT } from "./shaders";
 import { Surfaces, type Uniforms } from "./surfaces";
+import { Transparency } from "./transparency";
 
 /** Side of the shadow map in texels on a GPU, and on the CPU. */
 const SHADOW_SIZE = 2048;
@@ -38,11 +39,14 @@ export class SceneRenderer {
     readonly diagonal: number;
     private readonly shadowSize: number;
     private readonly surfaces: Surfaces;
+    private readonly transparency: Transparency;
     private readonly background: FullscreenPass;
     private readonly plain: FullscreenPass;
     private readonly shadowTarget: THREE.WebGLRenderTarget;
     private readonly light: Uniforms;
     private readonly shadowUniforms: Uniforms = { clip_from_world: { value: new THREE.Matrix4() } };
+    /** The tone curve of blended pictures. */
+    private readonly tone: Uniforms = { exposure: { value: 1 }, tone: { value: 0 } };
     private readonly restSpheres: Sphere[];
     private spheres: DomainSphere[] = [];
     private state: SceneState | null = null;
@@ -69,14 +73,16 @@ export class SceneRenderer {
         this.shadowTarget = createShadowTarget(this.shadowSize);
         this.light = this.createLight();
         const quality = { anisotropy: renderer.capabilities.getMaxAnisotropy(), blendsLevels: !isSoftware };
-        this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, this.shadowUniforms, quality);
+        this.transparency = new Transparency(renderer, isSoftware, this.tone);
+        const { uniforms } = this.transparency;
+        this.surfaces = new Surfaces(scene, arrays, this.deformer, this.light, uniforms, this.shadowUniforms, quality);
         this.background = this.createBackground();
         this.background.define("SINGLE_LOOKUP", isSoftware);
         this.plain = new FullscreenPass(PLAIN_FRAGMENT, {
             plain: new THREE.Vector3(PLAIN_GRAY, PLAIN_GRAY, PLAIN_GRAY),
         });
         this.plain.mesh.visible = false;
-        for (const pass of [this.background, this.plain]) {
+        for (const pass of this.backgrounds) {
             pass.mesh.renderOrder = -1;
             this.surfaces.colorScene.add(pass.mesh);
         }
@@ -90,6 +96,12 @@ export class SceneRenderer {
         this.surfaces.setShadows(this.options.shadows);
         this.background.define("SHADOWS", this.options.shadows);
         this.surfaces.setEdges(options.edges);
+        this.surfaces.setLinearOutput(this.needsBlending);
+        for (const pass of this.backgrounds) pass.define("LINEAR_OUTPUT", this.needsBlending);
+        if (!this.needsBlending) this.transparency.release();
+        // Color maps have no tone curve.
+        this.setUniform(this.tone, "exposure", isMap ? 1 : this.lighting.exposure);
+        this.setUniform(this.tone, "tone", isMap ? 0 : this.lighting.tone);
         this.background.mesh.visible = !isMap;
         this.plain.mesh.visible = isMap;
         this.colorScale = 0;
@@ -137,8 +149,22 @@ export class SceneRenderer {
     render(camera: THREE.PerspectiveCamera): void {
         this.prepare(camera);
         if (this.options.shadows && this.needsShadow && this.options.color.kind === "shaded") this.renderShadow();
+        const { colorScene, blendScene, blendMaterials } = this.surfaces;
+        if (this.needsBlending) {
+            this.transparency.render({ opaque: colorScene, blended: blendScene, blendMaterials }, camera);
+            return;
+        }
         this.renderer.setRenderTarget(null);
-        this.renderer.render(this.surfaces.colorScene, camera);
+        this.renderer.render(colorScene, camera);
+    }
+
+    /** Whether surfaces or lines are blended. Other scenes are drawn to the canvas directly. */
+    private get needsBlending(): boolean {
+        return this.options.edges || this.surfaces.blendMaterials.length > 0;
+    }
+
+    private get backgrounds(): FullscreenPass[] {
+        return [this.background, this.plain];
     }
 
     /** Index of the domain at each pixel, top row first; 0xffffffff where there is no surface. It waits for the GPU. */
@@ -195,6 +221,7 @@ export class SceneRenderer {
     dispose(): void {
         this.deformer.dispose();
         this.surfaces.dispose();
+        this.transparency.dispose();
         this.background.dispose();
         this.plain.dispose();
         this.shadowTarget.depthTexture?.dispose();
@@ -236,7 +263,11 @@ export class SceneRenderer {
     }
 
     private setLight(name: string, value: unknown): void {
-        const uniform = this.light[name];
+        this.setUniform(this.light, name, value);
+    }
+
+    private setUniform(uniforms: Uniforms, name: string, value: unknown): void {
+        const uniform = uniforms[name];
         if (uniform) uniform.value = value;
     }
 

@@ -144,6 +144,19 @@ vec3 displayed(vec3 light) {
 }
 `;
 
+/** From light to the color of a pixel. With LINEAR_OUTPUT, light is written, and `Transparency` makes the colors. */
+const PIXEL_COLOR = `
+${TONE}
+${SRGB}
+#ifdef LINEAR_OUTPUT
+vec3 apply_tone_curve(vec3 light) { return min(light, vec3(65504.0)); }
+vec3 encode_pixel(vec3 light) { return light; }
+#else
+vec3 apply_tone_curve(vec3 light) { return displayed(light); }
+vec3 encode_pixel(vec3 light) { return encode_srgb(light); }
+#endif
+`;
+
 const SHADOW_LOOKUP = `
 #ifdef SHADOWS
 uniform sampler2DShadow shadow_map;
@@ -178,7 +191,8 @@ float sun_visibility(vec3 world, vec3 normal) { return 1.0; }
 
 /**
  * Phong shading with the formula of MaterialDescription, or a color map.
- * Defines: SHADOWS, COLOR_TEXTURE, NORMAL_TEXTURE, MASK, BLEND, COLOR_MAP.
+ * Defines: SHADOWS, COLOR_TEXTURE, NORMAL_TEXTURE, MASK, COLOR_MAP, LINEAR_OUTPUT, and BLEND for a layer of blended
+ * surfaces (see `Transparency`), whose color is premultiplied.
  */
 export const SURFACE_FRAGMENT = `${PRECISION}
 in vec3 world;
@@ -199,9 +213,19 @@ uniform sampler2D color_texture;
 uniform sampler2D normal_texture;
 uniform float map_scale;             // 1 / value at the bright end of the color map
 out vec4 color;
+#ifdef BLEND
+uniform int layer;                   // 0: the nearest layer
+uniform sampler2D opaque_depth;
+uniform sampler2D nearer_depth;      // of the previous layer
+// Whether an opaque surface hides the fragment, or an earlier layer has drawn it.
+bool is_hidden() {
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    return gl_FragCoord.z >= texelFetch(opaque_depth, pixel, 0).x ||
+        layer > 0 && gl_FragCoord.z <= texelFetch(nearer_depth, pixel, 0).x;
+}
+#endif
 ${SHADOW_LOOKUP}
-${TONE}
-${SRGB}
+${PIXEL_COLOR}
 #ifdef COLOR_MAP
 // viridis: Matt Zucker's polynomial (shadertoy.com/view/WlfXRN, CC0), as the server's color maps.
 vec3 viridis(float t) {
@@ -242,6 +266,10 @@ void main() {
 #ifdef MASK
     if (opacity < cutoff) discard;
 #endif
+#ifdef BLEND
+    if (!(opacity > 0.0) || is_hidden()) discard;
+    opacity = min(opacity, 1.0);
+#endif
     vec3 surface_normal = normalize(world_normal);
     vec3 shading_normal = surface_normal;
 #ifdef NORMAL_TEXTURE
@@ -262,17 +290,17 @@ void main() {
         vec3 shadow_normal = gl_FrontFacing ? surface_normal : -surface_normal;
         light += sun_visibility(world, shadow_normal) * sunlight * (cosine * diffuse * tint.rgb + shine * specular);
     }
-    light = displayed(light);
+    light = apply_tone_curve(light);
 #endif
     light = mix(light, vec3(1.0, 0.55, 0.1), 0.45 * highlight);
 #ifndef BLEND
     opacity = 1.0;
 #endif
-    color = vec4(encode_srgb(light), opacity);
+    color = vec4(opacity * encode_pixel(light), opacity);
 }
 `;
 
-/** Sky and ground behind all surfaces, as the server draws them. Defines: SHADOWS, GROUND. */
+/** Sky and ground behind all surfaces, as the server draws them. Defines: SHADOWS, GROUND, LINEAR_OUTPUT. */
 export const BACKGROUND_FRAGMENT = `${PRECISION}
 in vec2 ndc;
 uniform mat4 world_from_ndc;         // from (x, y, 1) to the direction of a view ray
@@ -286,8 +314,7 @@ uniform vec4 ground;                 // color; w: fade length D: the weight at d
 uniform vec4 ground_center;          // w: height along the up axis
 out vec4 color;
 ${SHADOW_LOOKUP}
-${TONE}
-${SRGB}
+${PIXEL_COLOR}
 void main() {
     vec3 direction = mat3(world_from_ndc) * vec3(ndc, 1.0);
     float sine = max(dot(normalize(direction), up), 0.0);
@@ -303,16 +330,45 @@ void main() {
         light = mix(horizon, ground_light * ground.rgb, weight);
     }
 #endif
-    color = vec4(encode_srgb(displayed(light)), 1.0);
+    color = vec4(encode_pixel(apply_tone_curve(light)), 1.0);
 }
 `;
 
-/** The background of color maps. */
+/** The background of color maps. Defines: LINEAR_OUTPUT. */
 export const PLAIN_FRAGMENT = `${PRECISION}
 uniform vec3 plain;
 out vec4 color;
+${PIXEL_COLOR}
+void main() { color = vec4(encode_pixel(plain), 1.0); }
+`;
+
+/** Copies a texture of the same size. */
+export const COPY_FRAGMENT = `${PRECISION}
+uniform sampler2D source;
+out vec4 color;
+void main() { color = texelFetch(source, ivec2(gl_FragCoord.xy), 0); }
+`;
+
+/** Blended layers (premultiplied) over opaque surfaces: one sample of a pixel after the tone curve, times its weight. */
+export const BLEND_FRAGMENT = `${PRECISION}
+uniform sampler2D opaque;
+uniform sampler2D layers;
+uniform float weight;
+out vec4 color;
+${TONE}
+void main() {
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    vec4 front = texelFetch(layers, pixel, 0);
+    color = vec4(weight * displayed(front.rgb + (1.0 - front.a) * texelFetch(opaque, pixel, 0).rgb), 1.0);
+}
+`;
+
+/** From linear light to the canvas. */
+export const ENCODE_FRAGMENT = `${PRECISION}
+uniform sampler2D source;
+out vec4 color;
 ${SRGB}
-void main() { color = vec4(encode_srgb(plain), 1.0); }
+void main() { color = vec4(encode_srgb(texelFetch(source, ivec2(gl_FragCoord.xy), 0).rgb), 1.0); }
 `;
 
 /** Depth in the shadow map. Defines: CUT_OUT (fragments below the cutoff cast no shadow). */
@@ -382,7 +438,8 @@ void main() {
 }
 `;
 
+/** The light of the server's lines. */
 export const EDGE_FRAGMENT = `${PRECISION}
 out vec4 color;
-void main() { color = vec4(0.02, 0.02, 0.02, 0.55); }
+void main() { color = vec4(vec3(0.02), 0.85); }
 `;

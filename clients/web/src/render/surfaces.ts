@@ -43,7 +43,11 @@ export function meshBytes(scene: SceneDescription): number {
 const CORNER_BYTES = 20;
 
 export class Surfaces {
+    /** Opaque surfaces, and lines along their edges. */
     readonly colorScene = new THREE.Scene();
+    /** Blended surfaces, as `Transparency` draws them. */
+    readonly blendScene = new THREE.Scene();
+    readonly blendMaterials: THREE.RawShaderMaterial[] = [];
     readonly shadowScene = new THREE.Scene();
     readonly domainScene = new THREE.Scene();
     private readonly geometry: THREE.BufferGeometry;
@@ -54,13 +58,19 @@ export class Surfaces {
     private readonly blank: THREE.DataTexture;
     private readonly meshes: THREE.Mesh[];
     private edges: THREE.LineSegments | null = null;
+    /** Indices of the triangles of opaque surfaces, which come first. */
+    private opaqueIndices = 0;
 
-    /** @param light Uniforms that all surfaces share: light, eye, shadow map, color map. */
+    /**
+     * @param light Uniforms that all surfaces share: light, eye, shadow map, color map.
+     * @param layer Uniforms that all blended surfaces share: see `Transparency`.
+     */
     constructor(
         private readonly scene: SceneDescription,
         private readonly arrays: SceneArrays,
         private readonly deformer: Deformer,
         private readonly light: Uniforms,
+        private readonly layer: Uniforms,
         private readonly shadow: Uniforms,
         private readonly quality: TextureQuality,
     ) {
@@ -74,8 +84,14 @@ export class Surfaces {
             parent.add(result);
             return result;
         };
+        const hidden = new THREE.MeshBasicMaterial({ visible: false });
+        const select = (isBlended: boolean) =>
+            this.colorMaterials.map((material) =>
+                this.blendMaterials.includes(material) === isBlended ? material : hidden,
+            );
         this.meshes = [
-            mesh(this.colorMaterials, this.colorScene),
+            mesh(select(false), this.colorScene),
+            mesh(select(true), this.blendScene),
             mesh(this.shadowMaterials, this.shadowScene),
             mesh(this.domainMaterials, this.domainScene),
         ];
@@ -91,6 +107,11 @@ export class Surfaces {
     setColorMode(mode: ColorMode): void {
         for (const material of this.colorMaterials) setDefine(material, "COLOR_MAP", mode.kind === "map");
         if (mode.kind === "map") this.setLight("map_scale", mode.largest > 0 ? 1 / mode.largest : 0);
+    }
+
+    /** Whether surfaces write light that `Transparency` blends, instead of the colors of pixels. */
+    setLinearOutput(isOn: boolean): void {
+        for (const material of this.colorMaterials) setDefine(material, "LINEAR_OUTPUT", isOn);
     }
 
     setShadows(isOn: boolean): void {
@@ -167,13 +188,12 @@ export class Surfaces {
         const color = create(
             SURFACE_VERTEX,
             SURFACE_FRAGMENT,
-            { ...this.light, ...phong },
+            { ...this.light, ...phong, ...(blends ? this.layer : {}) },
             {
                 side,
                 defines,
-                transparent: blends,
-                depthWrite: !blends,
-                polygonOffset: true,
+                // Blended surfaces have no lines. Their depths are compared with gl_FragCoord.z, which has no offset.
+                polygonOffset: !blends,
                 polygonOffsetFactor: 0.5,
                 polygonOffsetUnits: 1,
             },
@@ -195,6 +215,7 @@ export class Surfaces {
             { side, defines: isMask ? { MASK: "" } : {}, visible: !blends },
         );
         this.colorMaterials.push(color);
+        if (blends) this.blendMaterials.push(color);
         this.shadowMaterials.push(shadow);
         this.domainMaterials.push(domain);
     }
@@ -278,6 +299,7 @@ export class Surfaces {
                 for (let i = 3 * begin; i < 3 * end; i++) index[place++] = at(indices, i) + offset;
             }
             if (place > first) geometry.addGroup(first, place - first, material);
+            if (rank(material) === 0) this.opaqueIndices = place;
         }
         geometry.setIndex(new THREE.BufferAttribute(index, 1));
     }
@@ -300,13 +322,16 @@ export class Surfaces {
         return result;
     }
 
-    /** Lines along all triangle edges, each once. The description does not mark the diagonals of polygons. */
+    /**
+     * Lines along the triangle edges of opaque surfaces, each once. The description does not mark the diagonals of
+     * polygons.
+     */
     private createEdges(): THREE.LineSegments {
         const index = this.geometry.getIndex()?.array ?? new Uint32Array();
         const vertices = this.geometry.getAttribute("vertex").array;
         const lines: number[] = [];
         const seen = new Set<number>();
-        for (let corner = 0; corner < index.length; corner++) {
+        for (let corner = 0; corner < this.opaqueIndices; corner++) {
             const a = at(index, corner);
             const b = at(index, corner % 3 === 2 ? corner - 2 : corner + 1);
             const [u, v] = [at(vertices, 2 * a), at(vertices, 2 * b)];

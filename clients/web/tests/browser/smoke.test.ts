@@ -5,12 +5,13 @@ import { test } from "node:test";
 import type { Page } from "playwright-core";
 import type { SurfacePoint } from "../../src/control/surface_point";
 import { Delivery } from "../../src/proto/modalcast/v1/common_pb";
-import { Format, FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
+import { FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
 import type { CameraMessage } from "../../src/render/camera";
 import { parseArrays } from "../../src/scene/arrays";
 import { Kinematics } from "../../src/scene/kinematics";
 import { SceneModel } from "../../src/scene/scene_model";
 import { end, startSimulation } from "./harness";
+import { cameraOf, meanDifference, serverPicture } from "./pictures";
 import { TreeSetup } from "./tree_setup";
 
 const WIDTH = 480;
@@ -62,10 +63,6 @@ async function bend(q0: number): Promise<bigint> {
 
 function waitForStep(page: Page, number: bigint): Promise<unknown> {
     return page.waitForFunction((text) => String(modalcastViewer.model?.state.step?.number) === text, String(number));
-}
-
-function cameraOf(page: Page): Promise<CameraMessage> {
-    return page.evaluate(() => modalcastViewer.viewport.camera.toMessage());
 }
 
 /**
@@ -223,7 +220,7 @@ test("the server's pictures follow the camera and the size of the window", { tim
  * picture may stay for seconds on a busy machine.
  */
 async function waitForServerPicture(page: Page, width: number, height: number): Promise<number[]> {
-    const expected = await serverPicture(await cameraOf(page), width, height);
+    const expected = await serverPicture(await server.client(), "tree", await cameraOf(page), [width, height]);
     const limit = performance.now() + LIMIT_MS / 3;
     for (;;) {
         const { size, pixels } = await shownPicture(page);
@@ -248,24 +245,6 @@ function shownPicture(page: Page): Promise<ShownPicture> {
         const pixels = canvas.getContext("2d")?.getImageData(0, 0, canvas.width, canvas.height).data ?? [];
         return { size: [canvas.width, canvas.height], pixels: Array.from(pixels) };
     });
-}
-
-async function serverPicture(camera: CameraMessage, width: number, height: number): Promise<Uint8Array> {
-    // Streams of this size have one sample per pixel on a CPU, single frames have four by default.
-    const request = { scene: "tree", pictures: [{ width, height, camera, format: Format.RGBA, samples: 1 }] };
-    const bytes = new Uint8Array(4 * width * height);
-    const { channel } = await server.client();
-    for await (const { part } of channel.serverStream(FrameService.method.renderFrame, request)) {
-        if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
-    }
-    return bytes;
-}
-
-/** Of RGBA values of 0 to 255. */
-function meanDifference(a: ArrayLike<number>, b: ArrayLike<number>): number {
-    let sum = 0;
-    for (let index = 0; index < a.length; index++) sum += Math.abs((a[index] ?? 0) - (b[index] ?? 0));
-    return sum / a.length;
 }
 
 test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, async () => {
