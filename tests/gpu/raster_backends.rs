@@ -545,7 +545,10 @@ fn gpu_fastest_rasterizer_draws_frames_of_every_size() {
         .expect("expected the scene to load");
     for [width, height] in [[64, 48], [1920, 1080], [1, 1], [333, 77]] {
         let camera = Camera::fit_to_scene(&scene, width, height);
-        let image = context.draw(&mut loaded_scene, &camera, FrameSize::new(width, height)).expect("expected a frame");
+        let mut draw = || context.draw(&mut loaded_scene, &camera, FrameSize::new(width, height)).expect("a frame");
+        // The first frame of a size is drawn in pieces, without shared memory.
+        draw();
+        let image = draw();
         eprintln!("{width} x {height}: {:?}", image.info.raster_backends);
         let visibility = image.info.raster_backends.visibility;
         assert!(visibility.is_some());
