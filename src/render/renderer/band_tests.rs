@@ -293,7 +293,11 @@ fn shadow_map_is_drawn_once_for_all_bands() {
     }
     let pending_frame = renderer.finish_frame(partial_frame).expect("finishes");
     let timed = |pass: Pass| pending_frame.passes.iter().filter(|(timed_pass, _)| *timed_pass == pass).count();
-    assert_eq!([Pass::Shadow, Pass::Blur, Pass::Shade, Pass::Encode].map(timed), [1, 1, 4, 4]);
+    // The smallest bands of the map, each of which is blurred once.
+    let map = random_scene.buffers.shadow.as_ref().expect("a shadow map");
+    let blur_bands = crate::passes::shadow::blur_bands(map, 0).len();
+    assert!(blur_bands > 1);
+    assert_eq!([Pass::Shadow, Pass::Blur, Pass::Shade, Pass::Encode].map(timed), [1, blur_bands, 4, 4]);
     let image = renderer.read_image(pending_frame).expect("draws");
     assert_eq!(image.times.iter().filter(|(key, _)| key.name() == "shade").count(), 1, "{:?}", image.times);
 }
