@@ -80,9 +80,12 @@ impl ShaderOptions {
         let mut text = String::new();
         if let Some(shadow) = self.features.variance_shadow() {
             writeln!(text, "const float DEVIATION = {:?};", shadow.filter_deviation() as f32).ok();
+            writeln!(text, "const float ROUNDING_VARIANCE = {:?};", shadow.variance_floor()).ok();
         }
-        let percentage_closer = self.features.shadow.filter(|shadow| shadow.method == ShadowMethod::PercentageCloser);
-        if let Some(shadow) = percentage_closer {
+        let filters_depth = |shadow: &ShadowSettings| {
+            shadow.method == ShadowMethod::PercentageCloser || shadow.filters_undecided_points()
+        };
+        if let Some(shadow) = self.features.shadow.filter(filters_depth) {
             let taps = gaussian_weights(shadow.blur);
             writeln!(text, "#define RADIUS {}", taps.len() - 1).ok();
             let tap_list: String = taps.iter().map(|weight| format!("{weight:?}, ")).collect();
@@ -278,7 +281,9 @@ mod tests {
         {
             let shadow = ShadowSettings { method, ..ShadowSettings::default() };
             let features = |shadow| ShaderFeatures { shadow: Some(shadow), ..ShaderFeatures::NONE };
-            assert_eq!(features(shadow).defines(), ["SHADOWS", define]);
+            let fallback = (method == ShadowMethod::Variance).then_some("PCF_FALLBACK");
+            let expected_defines: Vec<&str> = ["SHADOWS", define].into_iter().chain(fallback).collect();
+            assert_eq!(features(shadow).defines(), expected_defines);
             let options = ShaderOptions {
                 features: features(shadow),
                 image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
@@ -288,11 +293,13 @@ mod tests {
                 sample_resolve: String::new(),
                 post_depth_coverage: false,
             };
-            assert_eq!(options.sun_visibility().contains("const float TAPS"), define == "SHADOW_FILTERED");
+            assert_eq!(options.sun_visibility().contains("const float TAPS"), define != "SHADOW_STANDARD");
             assert!(
                 !options.sun_visibility().contains("CascadeBlock")
                     && !options.shadow(BlendMode::Opaque).stages[0].1.contains("CascadeBlock")
             );
+            let without_fallback = ShadowSettings { pcf_fallback: false, ..shadow };
+            assert_eq!(features(without_fallback).defines(), ["SHADOWS", define]);
             let cascaded = ShaderOptions { features: features(ShadowSettings { cascades: 3, ..shadow }), ..options };
             assert!(cascaded.sun_visibility().contains("CascadeBlock"));
             let four_cascades = features(ShadowSettings { cascades: 4, ..shadow });

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `square` | a square that floats above the ground; its umbra and penumbra are known |
 //! | `shelf` | the narrow shadow of a square just above the ground, at one end of the shadow map's depth range |
+//! | `layers` | sheets above each other whose edges cross, and a floor below them that is mostly in full shadow |
 //! | `panes` | three translucent panes in front of an opaque wall, listed from nearest to farthest |
 //! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
@@ -32,6 +33,7 @@ use modalcast_model::scene::{Antialiasing, Camera, Lens, RenderSettings, Scene, 
 pub enum RenderWorkload {
     Square,
     Shelf,
+    Layers,
     Panes,
     Images,
     Tree,
@@ -67,7 +69,7 @@ impl RenderWorkload {
     /// Every workload, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
         let field = Self::Triangles(if quick { QUICK_FIELD_TRIANGLES } else { FULL_FIELD_TRIANGLES });
-        vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
+        vec![Self::Square, Self::Shelf, Self::Layers, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
     /// The workload with this name.
@@ -78,6 +80,7 @@ impl RenderWorkload {
         let workload = match name {
             "square" => Some(Self::Square),
             "shelf" => Some(Self::Shelf),
+            "layers" => Some(Self::Layers),
             "panes" => Some(Self::Panes),
             "images" => Some(Self::Images),
             "tree" => Some(Self::Tree),
@@ -87,7 +90,8 @@ impl RenderWorkload {
                 triangle_count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
             }
         };
-        let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
+        let expected =
+            format!("square, shelf, layers, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
         workload.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -96,6 +100,7 @@ impl RenderWorkload {
         match self {
             Self::Square => "square".into(),
             Self::Shelf => "shelf".into(),
+            Self::Layers => "layers".into(),
             Self::Panes => "panes".into(),
             Self::Images => "images".into(),
             Self::Tree => "tree".into(),
@@ -109,10 +114,11 @@ impl RenderWorkload {
     /// # Errors
     /// Errors of [`Scene::new`] and of generating the tree.
     pub(super) fn build(self) -> Result<AnimatedScene> {
-        // Sliding domains: the square, the red pane, the first panel, the poles of the field.
+        // Sliding domains: the square, the lowest sheet, the red pane, the first panel, the poles of the field.
         let (scene, sliding_domain) = match self {
             Self::Square => (Scene::new(build_square()?)?, Some(1)),
             Self::Shelf => (Scene::new(build_shelf()?)?, None),
+            Self::Layers => (Scene::new(build_layers()?)?, Some(1)),
             Self::Panes => (Scene::new(build_panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
             Self::Tree => (open_tree()?, None),
@@ -130,7 +136,8 @@ impl AnimatedScene {
         Self { name: deform_workload.name, workload, scene: deform_workload.scene, motion, sliding_domain }
     }
 
-    /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`. A `near` and
+    /// The camera of the workload's images. It frames the whole scene, except for `shelf`, `layers` and
+    /// `images`. A `near` and
     /// `far` of 0 are fitted to the scene.
     pub(super) fn camera(&self, size: Size) -> Camera {
         match self.workload {
@@ -139,6 +146,11 @@ impl AnimatedScene {
                 let point = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
                 let view = View::LookAt { eye: point(2.0), target: point(0.0), up: [0.0, 0.0, -1.0] };
                 Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
+            }
+            // From below the lowest sheet.
+            RenderWorkload::Layers => {
+                let view = View::LookAt { eye: [1.7, 0.24, 1.2], target: [0.0, 0.0, 0.0], up: [0.0, 1.0, 0.0] };
+                Camera { view, lens: Lens::FieldOfView(40.0), near: 0.0, far: 0.0 }
             }
             // The panels fill the image; the floor extends beyond it.
             RenderWorkload::Images => {
@@ -281,6 +293,24 @@ fn build_shelf() -> Result<SceneParts> {
         two_sided_material([0.80, 0.35, 0.25]),
     )?;
     parts.look = RenderSettings { sun: [3.0, 1.0, 0.0], ..RenderSettings::default() };
+    Ok(parts)
+}
+
+/// Builds a floor of four units and three horizontal sheets above it, each rotated about the up axis. Seen from the sun,
+/// the edges of the sheets cross, and the sheets are at very different distances from the floor.
+fn build_layers() -> Result<SceneParts> {
+    let mut parts = SceneParts::named("layers");
+    add_rigid_domain(&mut parts, "floor", horizontal_square(2.0, 0.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
+    // x, height, half side, rotation in radians.
+    let sheets = [(0.45, 0.3, 0.8, 0.3), (-0.5, 0.9, 0.9, -0.2), (-0.3, 2.5, 0.6, 0.9)];
+    for (index, (x, height, half_side, rotation)) in sheets.into_iter().enumerate() {
+        let (sin, cos) = f32::sin_cos(rotation);
+        let point = |u: f32, v: f32| [x + half_side * (u * cos - v * sin), height, half_side * (u * sin + v * cos)];
+        let corners = [point(-1.0, 1.0), point(1.0, 1.0), point(1.0, -1.0), point(-1.0, -1.0)];
+        let sheet = quad(corners, [0.0, 1.0, 0.0])?;
+        add_rigid_domain(&mut parts, &format!("sheet {index}"), sheet, two_sided_material([0.80, 0.35, 0.25]))?;
+    }
+    parts.look = RenderSettings { sun: [0.1, 1.0, 0.05], ..RenderSettings::default() };
     Ok(parts)
 }
 
