@@ -14,9 +14,10 @@ const PIXELS_PER_UNIT: f64 = 100.0;
 /// quantized to multiples of 4 / 16 = 0.25. The value 5, which is a multiple itself, becomes the next one, 5.25.
 const LIGHT_BOX_HALF_EXTENT: f64 = 5.25;
 
-/// A variance shadow map with a blur of 2 texels.
+/// A variance shadow map with a blur of 2 texels. Without the fallback to filtered depths, which would hide errors of
+/// the moments.
 fn variance_settings() -> ShadowSettings {
-    ShadowSettings { size: 256, blur: 2.0, bleeding: 0.0, ..ShadowSettings::default() }
+    ShadowSettings { size: 256, blur: 2.0, bleeding: 0.0, pcf_fallback: false, ..ShadowSettings::default() }
 }
 
 /// Side of a shadow map texel along z, in scene units. The light box covers the map except for its empty border.
@@ -88,6 +89,7 @@ fn filtered_and_variance_maps_give_the_blurred_edge() {
         (BlurMethod::Auto, ShadowSettings { method: ShadowMethod::PercentageCloser, blur: 0.7, ..base }),
         (BlurMethod::Rows, base),
         (BlurMethod::Tiles, base),
+        (BlurMethod::Auto, ShadowSettings { pcf_fallback: true, ..base }),
         (BlurMethod::Tiles, ShadowSettings { blur: 0.0, ..base }),
         (BlurMethod::Tiles, ShadowSettings { blur: 4.0, ..base }),
         (BlurMethod::Fragments, base),
@@ -155,6 +157,8 @@ fn shadow_edges_are_at_their_expected_distance() {
         (ShadowSettings { method: ShadowMethod::PercentageCloser, ..base }, 0.0),
         (base, 0.0),
         (ShadowSettings { bleeding: 0.2, ..base }, 0.2533 * 2.0),
+        (ShadowSettings { pcf_fallback: true, ..base }, 0.0),
+        (ShadowSettings { bleeding: 0.2, pcf_fallback: true, ..base }, 0.2533 * 2.0),
         (ShadowSettings { moments: MomentFormat::F16, ..base }, 0.0),
     ];
     for size in [64, 100, 256] {
