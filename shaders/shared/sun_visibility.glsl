@@ -62,17 +62,17 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
 
 #if defined(SHADOW_FILTERED) || defined(PCF_FALLBACK)
 // Percentage-closer filtering: weight of the texels without a caster in front of the point. The weights are a Gaussian
-// centered at the point. TAPS is one half of the Gaussian, center first, with a trailing 0.
-float percentage_closer_visibility(vec3 position, int layer, vec3 normal) {
+// centered at the point. TAPS is one half of the Gaussian, center first, with a trailing 0. `radius` is RADIUS.
+float percentage_closer_visibility(vec3 position, int layer, vec3 normal, int radius) {
     vec2 texel = position.xy * frame.shadow.w - 0.5;
     vec2 base_texel = floor(texel); // the point lies between this texel's center and those of its next neighbors
     vec2 fraction = texel - base_texel;
     vec2 gradient = receiver_plane_gradient(normal, layer);
     float receiver_depth = position.z - depth_bias(layer), lit_weight = 0.0;
-    for (int y = -RADIUS; y <= RADIUS; y += 2) {
+    for (int y = -radius; y <= radius; y += 2) {
         // Weights of rows y and y + 1, interpolated between Gaussians that are centered at rows 0 and 1.
         vec2 row_weights = mix(vec2(TAPS[abs(y)], TAPS[abs(y + 1)]), vec2(TAPS[abs(y - 1)], TAPS[abs(y)]), fraction.y);
-        for (int x = -RADIUS; x <= RADIUS; x += 2) {
+        for (int x = -radius; x <= radius; x += 2) {
             vec2 column_weights = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), fraction.x);
             vec2 corner = vec2(x, y);
             // The four texels around their common corner, in textureGather order (0, 1), (1, 1), (1, 0), (0, 0).
@@ -90,7 +90,7 @@ float percentage_closer_visibility(vec3 position, int layer, vec3 normal) {
 
 #ifdef SHADOW_FILTERED
 float shadow_visibility(vec3 position, int layer, vec3 normal) {
-    return percentage_closer_visibility(position, layer, normal);
+    return percentage_closer_visibility(position, layer, normal, RADIUS);
 }
 #endif
 
@@ -136,7 +136,10 @@ float shadow_visibility(vec3 position, int layer, vec3 normal) {
     }
 #ifdef PCF_FALLBACK
     if (bound > frame.shadow.y && !has_moments_of_surface(excess_depth, variance, layer, normal)) {
-        bound = min(bound, percentage_closer_visibility(position, layer, normal));
+        // Software rasterizers execute unrolled loops also where no lane is in this branch. A radius that depends on a
+        // uniform prevents unrolling.
+        int radius = frame.shadow.w > 0.0 ? RADIUS : 0;
+        bound = min(bound, percentage_closer_visibility(position, layer, normal, radius));
     }
 #endif
     return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
