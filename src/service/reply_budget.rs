@@ -323,7 +323,7 @@ impl CallReplies {
 /// Ends the calls whose clients have taken nothing for `timeout`. If all these calls were ended earlier, the bytes that
 /// they still hold are buffers of HTTP/2, which only the end of the connection frees, so their connections are closed.
 /// While another call of the connection holds bytes, which it may still send or release, the connection is closed only
-/// after `max_stall`; `None` means never.
+/// after `max_stall`; `None` means never. A call that was ended less than `timeout` ago may still release its queue.
 fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<Duration>) {
     let mut ended = Vec::new();
     let mut ends_running = false;
@@ -346,7 +346,7 @@ fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<
         for call in ended {
             let progress = *lock(&call.progress);
             if max_stall.is_none_or(|max_stall| progress.stall() < max_stall)
-                && holds_sendable_bytes(calls, &call.connection)
+                && may_free_bytes(calls, &call.connection, timeout)
             {
                 continue;
             }
@@ -357,10 +357,13 @@ fn end_stalled(calls: &[Arc<CallReplies>], timeout: Duration, max_stall: Option<
     }
 }
 
-/// Whether a call of the connection that was not ended has unsent bytes.
-fn holds_sendable_bytes(calls: &[Arc<CallReplies>], connection: &Arc<ConnectionReplyBudget>) -> bool {
+/// Whether a call of the connection has unsent bytes, and runs or was ended less than `timeout` ago.
+fn may_free_bytes(calls: &[Arc<CallReplies>], connection: &Arc<ConnectionReplyBudget>, timeout: Duration) -> bool {
     let mut of_connection = calls.iter().filter(|call| Arc::ptr_eq(&call.connection, connection));
-    of_connection.any(|call| lock(&call.progress).unsent_bytes > 0 && !call.is_ended())
+    of_connection.any(|call| {
+        let progress = *lock(&call.progress);
+        progress.unsent_bytes > 0 && (!call.is_ended() || progress.stall() < timeout)
+    })
 }
 
 impl Drop for CallReplies {
@@ -564,6 +567,25 @@ mod tests {
         assert!(is_closed().await, "expected a limit for calls of other connections");
         drop(running_bytes);
         end_stalled(&calls, Duration::from_secs(50), None);
+        assert!(is_closed().await, "expected nothing that could free bytes");
+    }
+
+    /// On a busy machine, a call needs time to release its queue after it was ended.
+    #[tokio::test]
+    async fn connection_with_a_call_that_just_ended_is_closed_later() {
+        let limit = Duration::from_secs(50);
+        let close = Arc::new(Notify::new());
+        let connection = small_budget().new_connection(Arc::clone(&close));
+        let calls = [connection.new_call(), connection.new_call()];
+        let _first_bytes = calls[0].acquire(20).await.expect("expected capacity");
+        let _second_bytes = calls[1].acquire(20).await.expect("expected capacity");
+        end_stalled(&calls, Duration::ZERO, None);
+        let is_closed = async || tokio::time::timeout(Duration::ZERO, close.notified()).await.is_ok();
+        lock(&calls[0].progress).last_change -= limit;
+        end_stalled(&calls, limit, None);
+        assert!(!is_closed().await, "expected time for the second call to release bytes");
+        lock(&calls[1].progress).last_change -= limit;
+        end_stalled(&calls, limit, None);
         assert!(is_closed().await, "expected nothing that could free bytes");
     }
 
