@@ -415,7 +415,9 @@ pub mod upload_arrays_request {
         Domain(super::UploadedDomain),
         /// The next bytes of the arrays of the current domain, little-endian and without gaps:
         ///
-        /// * rest positions x0: 3 f32 per vertex, in scene units and in the domain's own frame
+        /// * rest positions x0: 3 f32 per vertex, or 3 f64 with `f64_positions`, in scene units and in the domain's own
+        ///   frame,
+        ///   relative to UploadedDomain.origin
         /// * faces: 3 u32 per triangle, the indices of its vertices, counterclockwise seen from the front
         /// * U: row-major f32, `rank` entries in each of 3 * vertices rows, in scene units per unit of q; rows 3v, 3v + 1
         ///   and 3v + 2 belong to vertex v
@@ -458,7 +460,8 @@ pub struct UploadedDomain {
     /// must then be 0, and no chunks follow.
     #[prost(uint32, optional, tag = "5")]
     pub shares_shape_with: ::core::option::Option<u32>,
-    /// world_from_domain at rest: 12 little-endian f32, row-major 3x4, translation in scene units; empty: the identity.
+    /// world_from_domain at rest: 12 little-endian f32, or 12 f64, row-major 3x4, translation in scene units; empty: the
+    /// identity. f32 rounds the place of a domain that is far from the scene's origin.
     #[prost(bytes = "bytes", tag = "6")]
     pub placement: ::prost::bytes::Bytes,
     /// Diffuse color: linear red, green and blue, 0 to 1; empty: 0.65, 0.4, 0.22.
@@ -474,6 +477,13 @@ pub struct UploadedDomain {
     /// `shares_shape_with`. Vertices keep their numbers.
     #[prost(double, optional, tag = "9")]
     pub crease_angle: ::core::option::Option<f64>,
+    /// The point that the rest positions are relative to: three numbers in scene units, in the domain's own frame. x0 is
+    /// their sum in f64. Empty: zero. Must be empty with `shares_shape_with`.
+    #[prost(double, repeated, tag = "10")]
+    pub origin: ::prost::alloc::vec::Vec<f64>,
+    /// Whether the rest positions are f64. Must be false with `shares_shape_with`.
+    #[prost(bool, tag = "11")]
+    pub f64_positions: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct UploadArraysResponse {
@@ -607,9 +617,15 @@ pub struct ShapeDescription {
     /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
     #[prost(double, repeated, tag = "6")]
     pub eigenvalues: ::prost::alloc::vec::Vec<f64>,
-    /// All arrays of the shape.
+    /// All arrays of the shape, except an empty ARRAY_CENTERED_POSITIONS.
     #[prost(message, repeated, tag = "7")]
     pub arrays: ::prost::alloc::vec::Vec<ArrayDescription>,
+    /// c, the point that ARRAY_CENTERED_POSITIONS is relative to: three numbers in scene units, in the domain's own frame.
+    /// Empty unless the shape is so far from the origin of this frame that f32 rounds x0 by more than about 10^-6 of its
+    /// size. T acts on x0 = c + v: for T = (A, t), a vertex is at A (v + U q) + (A c + t). A client that computes A c + t
+    /// in f64 gets vertices with the accuracy of the server.
+    #[prost(double, repeated, tag = "8")]
+    pub origin: ::prost::alloc::vec::Vec<f64>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ArrayDescription {
@@ -735,6 +751,10 @@ pub struct DomainDescription {
         ::prost::alloc::string::String,
         ::prost::alloc::string::String,
     >,
+    /// world_from_domain at rest in f64: 12 numbers, row-major 3x4. Empty unless the domain is so far from the scene's
+    /// origin that `placement` rounds its place.
+    #[prost(double, repeated, tag = "16")]
+    pub exact_placement: ::prost::alloc::vec::Vec<f64>,
 }
 /// Consecutive triangles with one material. A range ends where the next one begins.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -860,7 +880,8 @@ pub enum Array {
     Indices = 1,
     /// u32 vertex v of each corner; vertex v has rows 3v, 3v + 1 and 3v + 2 of U.
     CornerVertices = 2,
-    /// f32 rest positions x0, three per vertex, in scene units and in the domain's own frame.
+    /// f32 rest positions x0, three per vertex, in scene units and in the domain's own frame. Rounded if the shape is far
+    /// from the origin of this frame (ShapeDescription.origin).
     RestPositions = 3,
     /// f32 texture coordinates, two per corner, (0, 0) at the top left; empty if the shape has none.
     Uvs = 4,
@@ -869,6 +890,9 @@ pub enum Array {
     /// f32 entries of U, row-major 3n x r, in scene units per unit of q: all modes, before any conversion to the
     /// scene's storage type; empty if r is 0. ReadModes returns selected rows.
     Modes = 6,
+    /// f32 rest positions relative to ShapeDescription.origin, three per vertex: v = x0 - origin, accurate to 10^-6 of the
+    /// size of the shape. Empty if the shape has no origin; ARRAY_REST_POSITIONS is then as accurate.
+    CenteredPositions = 7,
 }
 impl Array {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -884,6 +908,7 @@ impl Array {
             Self::Uvs => "ARRAY_UVS",
             Self::RestNormals => "ARRAY_REST_NORMALS",
             Self::Modes => "ARRAY_MODES",
+            Self::CenteredPositions => "ARRAY_CENTERED_POSITIONS",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -896,6 +921,7 @@ impl Array {
             "ARRAY_UVS" => Some(Self::Uvs),
             "ARRAY_REST_NORMALS" => Some(Self::RestNormals),
             "ARRAY_MODES" => Some(Self::Modes),
+            "ARRAY_CENTERED_POSITIONS" => Some(Self::CenteredPositions),
             _ => None,
         }
     }
@@ -2626,7 +2652,8 @@ pub struct Picture {
     pub height: u32,
     #[prost(enumeration = "Format", tag = "3")]
     pub format: i32,
-    /// Unset: a camera that frames the scene's rest bounds.
+    /// Unset: a camera that frames the scene's rest bounds or, in steps in which no domain is in that view, the domains
+    /// where they are (FrameHead.reframed).
     #[prost(message, optional, tag = "4")]
     pub camera: ::core::option::Option<Camera>,
     #[prost(enumeration = "Output", tag = "5")]
@@ -2801,8 +2828,9 @@ pub struct FrameStreamSettings {
     /// Number of steps after which the stream ends; 0: no limit.
     #[prost(uint64, tag = "3")]
     pub steps: u64,
-    /// Size, format, output and complete camera of each picture: view and lens are set. `near` and `far` remain 0 if
-    /// they clip nothing, and `largest` remains 0 if it is fitted to each frame.
+    /// Size, format, output and complete camera of each picture: view and lens are set. A camera that the request does not
+    /// set is the one that frames the rest bounds. `near` and `far` remain 0 if they clip nothing, and `largest` remains 0
+    /// if it is fitted to each frame.
     #[prost(message, repeated, tag = "4")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
     /// 16 random bytes that identify the stream in UpdateFrameStream. They permit any client to move the cameras, and the
@@ -2891,6 +2919,10 @@ pub struct FrameHead {
     /// ground by more than 1e-5 of the diagonal of the scene's rest bounds, or if the scene has no ground.
     #[prost(double, tag = "13")]
     pub below_ground: f64,
+    /// Whether the picture has no camera of its own and frames the domains where they are, because none of them is in the
+    /// view that frames the scene's rest bounds.
+    #[prost(bool, tag = "14")]
+    pub reframed: bool,
 }
 /// Antialiasing and shadow map of a frame. The scene's settings choose them, or the server by a rule that depends on the
 /// renderer, the pixels and the triangles; see `look` in the reference of scene.toml.

@@ -45,36 +45,51 @@ pub enum ShapeArray {
     RestNormals,
     /// f32 entries of U, row-major 3n x r.
     Modes,
+    /// f32 rest positions relative to the origin of the shape; empty if the shape has no origin.
+    CenteredPositions,
 }
 
 impl ShapeArray {
-    pub const ALL: [Self; 6] =
-        [Self::Indices, Self::CornerVertices, Self::RestPositions, Self::Uvs, Self::RestNormals, Self::Modes];
+    pub const ALL: [Self; 7] = [
+        Self::Indices,
+        Self::CornerVertices,
+        Self::RestPositions,
+        Self::Uvs,
+        Self::RestNormals,
+        Self::Modes,
+        Self::CenteredPositions,
+    ];
 
     /// Size of the array in bytes.
     pub fn size(self, shape: &Shape) -> usize {
         match self {
             Self::Modes => size_of_val(shape.modes.columns()),
+            Self::RestPositions => size_of_val(shape.mesh.rest_positions()),
             _ => self.stored_bytes(shape).len(),
         }
     }
 
     /// A range of bytes of the array of a shape. It is shared with the scene, except for the modes, which are stored in
-    /// another order. The range must lie within the size of the array.
+    /// another order, and for the rest positions of a shape with an origin. The range must lie within the size of the
+    /// array.
     pub fn read(self, scene: &Arc<Scene>, shape: usize, range: Range<usize>) -> Bytes {
         match self {
             Self::Modes => read_modes(&scene.shapes[shape], range),
+            Self::RestPositions if scene.shapes[shape].is_centered() => read_positions(&scene.shapes[shape], range),
             _ => share(scene, SceneContent::Array { shape, array: self }, range),
         }
     }
 
-    /// The bytes of an array that is stored as it is sent; empty for the modes, which are stored by columns.
+    /// The bytes of an array that is stored as it is sent; empty for the modes, which are stored by columns, and for
+    /// the rest positions of a shape with an origin.
     fn stored_bytes(self, shape: &Shape) -> &[u8] {
         let corners = shape.mesh.corners();
         match self {
             Self::Indices => bytemuck::cast_slice(shape.mesh.triangles()),
             Self::CornerVertices => bytemuck::cast_slice(&corners.vertices),
-            Self::RestPositions => bytemuck::cast_slice(shape.mesh.rest_positions()),
+            Self::CenteredPositions if shape.is_centered() => bytemuck::cast_slice(shape.mesh.rest_positions()),
+            Self::RestPositions if !shape.is_centered() => bytemuck::cast_slice(shape.mesh.rest_positions()),
+            Self::RestPositions | Self::CenteredPositions => &[],
             Self::Uvs => bytemuck::cast_slice(&corners.uvs),
             Self::RestNormals => bytemuck::cast_slice(&corners.normals),
             Self::Modes => &[],
@@ -99,6 +114,16 @@ impl AsRef<[u8]> for SharedContent {
 
 fn share(scene: &Arc<Scene>, content: SceneContent, range: Range<usize>) -> Bytes {
     Bytes::from_owner(SharedContent { scene: Arc::clone(scene), content }).slice(range)
+}
+
+/// A range of bytes of x0 in f32, for a shape with an origin.
+fn read_positions(shape: &Shape, range: Range<usize>) -> Bytes {
+    let first_number = range.start / 4;
+    let numbers = first_number..range.end.div_ceil(4);
+    let (positions, origin) = (shape.mesh.rest_positions().as_flattened(), shape.origin());
+    let x0 = |number: usize| (f64::from(positions[number]) + origin[number % 3]) as f32;
+    let bytes: Vec<u8> = numbers.map(x0).flat_map(f32::to_le_bytes).collect();
+    Bytes::from(bytes).slice(range.start - 4 * first_number..range.end - 4 * first_number)
 }
 
 /// Copies a range of bytes of U in row-major order.

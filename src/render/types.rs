@@ -103,6 +103,9 @@ pub struct FrameInfo {
     /// at most 1e-5 of the diagonal of the scene's rest bounds, which is an upper bound of the error of the vertices.
     /// Vertices outside of [`FrameParams::bounds`] are ignored.
     pub below_ground: f64,
+    /// Whether the camera frames the present state, because no domain is in the view that frames the scene at rest.
+    /// Only for pictures without a camera of their own.
+    pub is_reframed: bool,
 }
 
 /// The parts of a look that a preset can choose, as the renderer chose them for a frame.

@@ -13,7 +13,7 @@ use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{
-    Camera, FrameSize, PixelRect, RawStepUpdate, Scene, ToneMapping, TransformFormat, UpAxis,
+    Camera, CameraSource, FrameSize, PixelRect, RawStepUpdate, Scene, ToneMapping, TransformFormat, UpAxis,
 };
 
 mod camera;
@@ -276,10 +276,11 @@ fn parse_picture(
     Ok(RequestedPicture { spec: PictureSpec { camera, size, output, style }, format })
 }
 
-/// Validates the camera of a picture. An unset camera is fitted to the scene.
-fn parse_picture_camera(scene: &Scene, size: FrameSize, camera: Option<v1::Camera>) -> Result<Camera> {
+/// Validates the camera of a picture. An unset camera frames the scene.
+fn parse_picture_camera(scene: &Scene, size: FrameSize, camera: Option<v1::Camera>) -> Result<CameraSource> {
+    let Some(camera) = camera else { return Ok(CameraSource::framing(scene, size)) };
     let fit_to_scene = Camera::fit_to_scene(scene, size.width, size.height);
-    camera.map_or(Ok(fit_to_scene), |camera| camera::parse_camera(scene, fit_to_scene, camera))
+    camera::parse_camera(scene, fit_to_scene, camera).map(CameraSource::Fixed)
 }
 
 /// Validates new cameras of a stream's pictures. Returns the index of each picture with its camera.
@@ -287,11 +288,11 @@ pub(super) fn parse_moved_cameras(
     scene: &Scene,
     pictures: &[PictureSpec],
     cameras: Vec<v1::PictureCamera>,
-) -> Result<Vec<(usize, Camera)>> {
+) -> Result<Vec<(usize, CameraSource)>> {
     if cameras.is_empty() {
         return Err(invalid("cameras", "at least one camera", "none"));
     }
-    let mut moved_cameras = Vec::<(usize, Camera)>::with_capacity(cameras.len().min(pictures.len()));
+    let mut moved_cameras = Vec::<(usize, CameraSource)>::with_capacity(cameras.len().min(pictures.len()));
     for (position, v1::PictureCamera { picture: index, camera }) in cameras.into_iter().enumerate() {
         let picture = pictures.get(index as usize);
         let is_repeated = moved_cameras.iter().any(|(moved_index, _)| *moved_index == index as usize);
@@ -339,7 +340,7 @@ pub(super) fn wire_picture(RequestedPicture { spec, format }: &RequestedPicture)
         height: spec.size.height,
         format: wire_format(*format).into(),
         jpeg_quality,
-        camera: Some(camera::wire_camera(&spec.camera)),
+        camera: Some(camera::wire_camera(spec.camera.at_rest())),
         edge_width: (spec.output == engine::FrameOutput::Color)
             .then(|| spec.style.edges.map_or(0.0, |edges| edges.width)),
         samples: spec.style.samples.unwrap_or_default(),
@@ -403,9 +404,17 @@ pub(super) fn parse_array_upload_header(header: v1::UploadArraysHeader) -> Resul
 }
 
 pub(super) fn parse_uploaded_domain(domain: v1::UploadedDomain) -> Result<engine::UploadedDomain> {
-    let v1::UploadedDomain { vertices, triangles, rank, .. } = domain;
+    let v1::UploadedDomain { vertices, triangles, rank, f64_positions, .. } = domain;
+    let origin = match domain.origin[..] {
+        [] => [0.0; 3],
+        [x, y, z] => [x, y, z],
+        _ => return Err(invalid("origin", "none or 3 numbers", domain.origin.len())),
+    };
     let shape = match domain.shares_shape_with {
-        None => UploadedShape::Arrays { vertices, triangles, rank },
+        None => UploadedShape::Arrays { vertices, triangles, rank, f64_positions, origin },
+        Some(_) if f64_positions || !domain.origin.is_empty() => {
+            return Err(invalid("origin, f64_positions", "neither with shares_shape_with", "one of them"));
+        }
         Some(earlier) if (vertices, triangles, rank) == (0, 0, 0) => UploadedShape::OfDomain(earlier),
         Some(_) => {
             let given = format!("{vertices} vertices, {triangles} triangles, rank {rank}");
@@ -413,11 +422,12 @@ pub(super) fn parse_uploaded_domain(domain: v1::UploadedDomain) -> Result<engine
         }
     };
     let placement = match domain.placement.len() {
-        0 => Transform::IDENTITY,
-        48 => Transform::new(bytemuck::pod_read_unaligned(&domain.placement))
-            .map_err(|error| error.in_message("placement"))?,
-        length => return Err(invalid("placement", "0 or 48 bytes", format!("{length} bytes"))),
+        0 => Transform::IDENTITY.0.map(f64::from),
+        48 => bytemuck::pod_read_unaligned::<[f32; 12]>(&domain.placement).map(f64::from),
+        96 => bytemuck::pod_read_unaligned(&domain.placement),
+        length => return Err(invalid("placement", "0, 48 or 96 bytes", format!("{length} bytes"))),
     };
+    Transform::new(placement.map(|entry| entry as f32)).map_err(|error| error.in_message("placement"))?;
     let color = match domain.color[..] {
         [] => Material::UNSPECIFIED_COLOR,
         [red, green, blue] => [red, green, blue],

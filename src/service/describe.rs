@@ -205,6 +205,7 @@ fn parse_arrays(numbers: &[i32]) -> Result<Vec<ShapeArray>> {
             Ok(v1::Array::Uvs) => ShapeArray::Uvs,
             Ok(v1::Array::RestNormals) => ShapeArray::RestNormals,
             Ok(v1::Array::Modes) => ShapeArray::Modes,
+            Ok(v1::Array::CenteredPositions) => ShapeArray::CenteredPositions,
             Ok(v1::Array::Unspecified) | Err(_) => {
                 return Err(invalid(format!("arrays[{index}]"), "an array of this version", number));
             }
@@ -226,6 +227,7 @@ const fn wire_array(array: ShapeArray) -> v1::Array {
         ShapeArray::Uvs => v1::Array::Uvs,
         ShapeArray::RestNormals => v1::Array::RestNormals,
         ShapeArray::Modes => v1::Array::Modes,
+        ShapeArray::CenteredPositions => v1::Array::CenteredPositions,
     }
 }
 
@@ -365,6 +367,8 @@ impl Description<'_> {
             bytes: array.size(shape) as u64,
             sha256: array_hashes.map(|hashes| hashes[ordinal].to_vec().into()).unwrap_or_default(),
         };
+        let is_described =
+            |(_, array): &(usize, ShapeArray)| *array != ShapeArray::CenteredPositions || shape.is_centered();
         v1::ShapeDescription {
             shape: index as u32,
             vertices: shape.mesh.rest_positions().len() as u32,
@@ -372,7 +376,8 @@ impl Description<'_> {
             corners: shape.mesh.corners().vertices.len() as u32,
             triangles: shape.mesh.triangles().len() as u32,
             eigenvalues: self.eigenvalues_of_shape(index).to_vec(),
-            arrays: ShapeArray::ALL.into_iter().enumerate().map(describe_array).collect(),
+            arrays: ShapeArray::ALL.into_iter().enumerate().filter(is_described).map(describe_array).collect(),
+            origin: if shape.is_centered() { shape.origin().to_vec() } else { Vec::new() },
         }
     }
 
@@ -418,6 +423,7 @@ impl Description<'_> {
             eigenvalues: (eigenvalues != self.eigenvalues_of_shape(domain.shape))
                 .then(|| v1::Eigenvalues { values: eigenvalues.clone() }),
             notes: domain.metadata.notes.clone().into_iter().collect(),
+            exact_placement: exact_placement(domain),
         }
     }
 }
@@ -468,6 +474,15 @@ fn wire_material(index: usize, material: &Material) -> v1::MaterialDescription {
 
 const fn wire_material_range(range: &MaterialRange) -> v1::MaterialRange {
     v1::MaterialRange { first_triangle: range.first_triangle as u32, material: range.material as u32 }
+}
+
+/// The placement in f64, row-major 3x4. Empty if `placement` is as exact.
+fn exact_placement(domain: &Domain) -> Vec<f64> {
+    if domain.placement_remainder == [0.0; 12] {
+        return Vec::new();
+    }
+    let matrix = domain.placement_matrix();
+    (0..12).map(|entry| matrix[(entry / 4, entry % 4)]).collect()
 }
 
 /// 48 bytes: twelve little-endian f32.

@@ -14,7 +14,7 @@ use modalcast::engine::{
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::Error;
 use modalcast_model::load::SceneRepository;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, RawStepUpdate};
+use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, RawStepUpdate};
 
 /// Set in the process that has the fault. The value is what the process expects.
 const EXPECTATION: &str = "MODALCAST_TEST_EXPECTATION";
@@ -143,7 +143,7 @@ async fn output(scene: &SceneHandle) -> (Vec<f32>, Vec<u8>) {
     let OutputBody::Vertices(vertices) = vertices.body else { panic!("expected vertices") };
     let vertices = vertices.wait().await.expect("expected vertices");
     let size = FrameSize::new(320, 240);
-    let camera = Camera::fit_to_scene(&scene.scene, size.width, size.height);
+    let camera = CameraSource::framing(&scene.scene, size);
     let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
     let frames = scene.request_output(StepSelector::Current, OutputSpec::Frames(Arc::new([picture]))).await;
     let OutputBody::Frames(frames) = frames.expect("expected a frame").body else { panic!("expected frames") };

@@ -213,7 +213,7 @@ async fn invalid_domains_are_rejected_with_their_path() {
     let cases: [(Change, [&str; 3]); 8] = [
         (|it| it.rank = 513, ["rank", "0 to 512", "513"]),
         (|it| it.vertices = 0, ["vertices", "at least one vertex and one triangle", "0 vertices, 1 triangles"]),
-        (|it| it.placement = vec![0; 47].into(), ["placement", "0 or 48 bytes", "47 bytes"]),
+        (|it| it.placement = vec![0; 47].into(), ["placement", "0, 48 or 96 bytes", "47 bytes"]),
         (|it| it.color = vec![0.0, 2.0, 0.0], ["color", "numbers from 0 to 1", "[0.0, 2.0, 0.0]"]),
         (|it| it.eigenvalues = vec![1.0; 2], ["eigenvalues", "none or 1 finite numbers", "2 numbers"]),
         (|it| it.crease_angle = Some(181.0), ["crease_angle", "0 to 180 degrees", "181"]),

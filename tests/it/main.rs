@@ -15,6 +15,7 @@ mod deformers;
 mod descriptions;
 mod error_reasons;
 mod far;
+mod far_arrays;
 mod following;
 mod forces;
 mod frames;

@@ -9,6 +9,7 @@ mod culling_real;
 mod depth_range;
 mod draw_region;
 mod far;
+mod far_models;
 mod ground;
 mod harness;
 mod image_sizes;

@@ -8,7 +8,7 @@ use modalcast::engine::{
     Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepFrames, StepOutput,
 };
 use modalcast_model::backend_settings::BackendSettings;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Lens};
+use modalcast_model::scene::{Camera, CameraSource, FrameSize, FrameStyle, Lens};
 use modalcast_proto::v1;
 use v1::drive_scene_response::Kind as ResponseKind;
 
@@ -28,7 +28,13 @@ fn cameras(count: usize) -> Vec<Camera> {
 
 fn frame_output(camera: Camera) -> OutputSpec {
     OutputSpec::Frames(
-        [PictureSpec { camera, size: SIZE, output: FrameOutput::Color, style: FrameStyle::default() }].into(),
+        [PictureSpec {
+            camera: CameraSource::Fixed(camera),
+            size: SIZE,
+            output: FrameOutput::Color,
+            style: FrameStyle::default(),
+        }]
+        .into(),
     )
 }
 
@@ -148,7 +154,7 @@ async fn pictures_of_one_subscription_show_the_same_step() {
     let (server, cameras) = (start_server().await, cameras(5));
     let scene_handle = server.engine.find("attributes").expect("expected an open scene");
     let color = |camera: &Camera| PictureSpec {
-        camera: *camera,
+        camera: CameraSource::Fixed(*camera),
         size: SIZE,
         output: FrameOutput::Color,
         style: FrameStyle::default(),

@@ -176,14 +176,16 @@ impl Model {
         let has_eigenvalues = description_without_arrays.domains.iter().any(|domain| !domain.eigenvalues.is_empty());
         // Sampling needs rest positions. The tree scenario also needs triangles, for surface areas; only scenes with
         // eigenvalues use it.
-        let description = match (has_modes, has_eigenvalues) {
-            (false, _) => description_without_arrays,
-            (true, false) => client.describe(scene, &[ShapeArray::RestPositions]).await?,
-            (true, true) => {
-                client
-                    .describe(scene, &[ShapeArray::RestPositions, ShapeArray::Indices, ShapeArray::CornerVertices])
-                    .await?
-            }
+        let mut arrays = vec![ShapeArray::RestPositions];
+        if has_eigenvalues {
+            arrays.extend([ShapeArray::Indices, ShapeArray::CornerVertices]);
+        }
+        if description_without_arrays.shapes.iter().any(Shape::has_origin) {
+            arrays.push(ShapeArray::CenteredPositions);
+        }
+        let description = match has_modes {
+            false => description_without_arrays,
+            true => client.describe(scene, &arrays).await?,
         };
         let entries_per_sample: usize = description.domains.iter().map(|domain| 3 * domain.rank).sum();
         let max_surface_samples =
@@ -345,13 +347,13 @@ fn select_vertices(description: &SceneDescription, max_surface_samples: usize) -
 
 /// Index of the vertex nearest to the domain's origin.
 fn base_vertex(shape: &Shape) -> u32 {
-    let norm_squared =
-        |vertex: u32| shape.rest_positions[3 * vertex as usize..][..3].iter().map(|x| x * x).sum::<f32>();
+    let norm_squared = |vertex: u32| rest_position(shape, vertex).norm_squared();
     (0..shape.vertex_count as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
 }
 
 fn rest_position(shape: &Shape, vertex: u32) -> Vector3<f64> {
-    Vector3::from_fn(|component, _| f64::from(shape.rest_positions[3 * vertex as usize + component]))
+    let local_position = &shape.local_positions()[3 * vertex as usize..];
+    Vector3::from_fn(|component, _| shape.origin[component] + f64::from(local_position[component]))
 }
 
 /// The samples of a domain's selected vertices. They have no rows of U if `mode_rows` is `None`. The caller sets their

@@ -101,12 +101,11 @@ fn hash_file(path: &Path) -> std::io::Result<String> {
 fn add_domain(scene: &Scene, domain: usize, unit: f64, file: &mut SurfaceFile) {
     let shape = scene.shape_of(domain);
     let domain = &scene.domains[domain];
-    let placement = domain.placement.to_matrix();
+    let placement = domain.placement_matrix();
     let mesh = &mut file.mesh;
     let first_vertex = mesh.positions.len() as u32;
-    let place =
-        |position: &[f32; 3]| placement.transform_point(&Vector3::from(*position).cast::<f64>().into()).coords * unit;
-    mesh.positions.extend(shape.mesh.rest_positions().iter().map(place));
+    let place = |position: [f64; 3]| placement.transform_point(&position.into()).coords * unit;
+    mesh.positions.extend(shape.exact_positions().map(place));
     let normal_matrix = placement.fixed_view::<3, 3>(0, 0).try_inverse().unwrap_or_default().transpose();
     let corners = shape.mesh.corners();
     let rotate = |normal: [f32; 3]| {

@@ -124,7 +124,13 @@ async fn has_recorded_contents(client: &Client, recording: &Recording, name: &st
 
 /// The recorded meshes, modes and colors of all domains.
 fn array_upload(recording: &Recording, name: &str) -> Result<ArrayUpload> {
-    let arrays = [ShapeArray::Indices, ShapeArray::CornerVertices, ShapeArray::RestPositions, ShapeArray::Modes];
+    let arrays = [
+        ShapeArray::Indices,
+        ShapeArray::CornerVertices,
+        ShapeArray::RestPositions,
+        ShapeArray::CenteredPositions,
+        ShapeArray::Modes,
+    ];
     let mut description = recording.read_description(&arrays, false)?;
     let shapes = std::mem::take(&mut description.shapes);
     let SceneDescription { info, materials, domains, .. } = description;
@@ -132,16 +138,18 @@ fn array_upload(recording: &Recording, name: &str) -> Result<ArrayUpload> {
     let mut first_domains: HashMap<usize, u32> = HashMap::new();
     let mut upload = ArrayUpload::new(name).unit(info.unit).up(&info.up);
     for (index, domain) in domains.iter().enumerate() {
-        let shape = match (shapes[domain.shape].take(), first_domains.get(&domain.shape)) {
+        let (shape, origin) = match (shapes[domain.shape].take(), first_domains.get(&domain.shape)) {
             (Some(shape), _) => {
                 first_domains.insert(domain.shape, index as u32);
-                upload_shape(shape)
+                let origin = shape.origin;
+                (upload_shape(shape), origin)
             }
-            (None, first) => UploadShape::OfDomain(first.copied().unwrap_or_default()),
+            (None, first) => (UploadShape::OfDomain(first.copied().unwrap_or_default()), [0.0; 3]),
         };
         let color = materials.get(domain.material).map_or([0.5; 3], |material| material.diffuse);
         let domain = UploadDomain::new(&domain.name, shape)
-            .placement(domain.placement)
+            .origin(origin)
+            .exact_placement(domain.exact_placement)
             .color(color)
             .eigenvalues(&domain.eigenvalues);
         upload = upload.domain(domain);
@@ -153,7 +161,7 @@ fn upload_shape(shape: Shape) -> UploadShape {
     // `check_arrays` has checked the lengths and the indices.
     let vertices: Vec<u32> = shape.indices.iter().map(|corner| shape.corner_vertices[*corner as usize]).collect();
     UploadShape::Arrays {
-        positions: shape.rest_positions.as_chunks().0.to_vec(),
+        positions: shape.local_positions().as_chunks().0.to_vec(),
         triangles: vertices.as_chunks().0.to_vec(),
         rank: shape.rank as u32,
         modes: shape.modes,

@@ -31,6 +31,8 @@ pub struct StepConverter {
     unit: f64,
     /// Whether transforms are relative to another origin than that of the scene.
     has_moved_origin: bool,
+    /// Per domain, the origin of its shape ([`modalcast_client::Shape::origin`]).
+    shape_origins: Vec<[f64; 3]>,
 }
 
 impl StepConverter {
@@ -47,6 +49,7 @@ impl StepConverter {
             scene_origin: std::array::from_fn(|axis| origin.get(axis).copied().unwrap_or(0.0)),
             unit: description.info.unit,
             has_moved_origin: false,
+            shape_origins: domains().map(|domain| description.shapes[domain.shape].origin).collect(),
         }
     }
 
@@ -94,14 +97,18 @@ impl StepConverter {
             return Err(Error::invalid(field, expected, format!("{transform:?}")));
         }
         let origin = state.origin(domain as usize).unwrap_or_default();
+        let rotation = DQuat::from_mat3(&linear).normalize().as_quat().to_array();
+        // The rounded rotation moves a shape that is far from the origin of its frame. The translation compensates it.
+        let shape_origin = DVec3::from_array(self.shape_origins.get(domain as usize).copied().unwrap_or_default());
+        let rounded = DMat3::from_quat(DQuat::from_array(rotation.map(f64::from)).normalize());
+        let correction = (linear - rounded) * shape_origin;
         let translation = std::array::from_fn(|axis| {
             let origin = match self.target {
                 StepTarget::RecordedScene => origin[axis],
                 StepTarget::UploadedArrays => origin[axis] - self.scene_origin[axis],
             };
-            origin / self.unit + entry(axis, 3)
+            origin / self.unit + entry(axis, 3) + correction[axis]
         });
-        let rotation = DQuat::from_mat3(&linear).normalize().as_quat().to_array();
         Ok(DomainTransform::QuaternionXyzwF64 { rotation, translation })
     }
 }

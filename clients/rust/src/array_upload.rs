@@ -40,7 +40,8 @@ impl UploadShape {
 pub struct UploadDomain {
     name: String,
     shape: UploadShape,
-    placement: Option<[f32; 12]>,
+    origin: [f64; 3],
+    placement: Option<[f64; 12]>,
     color: Option<[f32; 3]>,
     eigenvalues: Vec<f64>,
     crease_angle: Option<f64>,
@@ -49,12 +50,34 @@ pub struct UploadDomain {
 impl UploadDomain {
     /// A domain of the default color at the origin. Its name must be unique in the upload.
     pub fn new(name: &str, shape: UploadShape) -> Self {
-        Self { name: name.to_owned(), shape, placement: None, color: None, eigenvalues: vec![], crease_angle: None }
+        Self {
+            name: name.to_owned(),
+            shape,
+            origin: [0.0; 3],
+            placement: None,
+            color: None,
+            eigenvalues: vec![],
+            crease_angle: None,
+        }
+    }
+
+    /// Sets the point that the positions are relative to, in scene units and in the domain's own frame. It keeps f32
+    /// positions accurate at any distance from the origin of this frame. For [`UploadShape::Arrays`] only.
+    #[must_use]
+    pub const fn origin(mut self, origin: [f64; 3]) -> Self {
+        self.origin = origin;
+        self
     }
 
     /// Sets `world_from_domain` at rest: row-major 3x4, translation in scene units.
     #[must_use]
-    pub const fn placement(mut self, world_from_domain: [f32; 12]) -> Self {
+    pub fn placement(self, world_from_domain: [f32; 12]) -> Self {
+        self.exact_placement(world_from_domain.map(f64::from))
+    }
+
+    /// As [`Self::placement`], in f64 for domains that are far from the scene's origin.
+    #[must_use]
+    pub const fn exact_placement(mut self, world_from_domain: [f64; 12]) -> Self {
         self.placement = Some(world_from_domain);
         self
     }
@@ -83,7 +106,8 @@ impl UploadDomain {
     fn to_wire(&self) -> v1::UploadedDomain {
         let mut wire = v1::UploadedDomain {
             name: self.name.clone(),
-            placement: self.placement.map(|entries| pack(&entries)).unwrap_or_default(),
+            placement: self.placement.map(|entries| pack_placement(&entries)).unwrap_or_default(),
+            origin: if self.origin == [0.0; 3] { vec![] } else { self.origin.to_vec() },
             color: self.color.map(|color| color.to_vec()).unwrap_or_default(),
             eigenvalues: self.eigenvalues.clone(),
             crease_angle: self.crease_angle,
@@ -159,6 +183,12 @@ impl ArrayUpload {
 /// The length of a list. The server rejects `u32::MAX`, which stands for all larger lengths.
 fn wire_count<T>(list: &[T]) -> u32 {
     u32::try_from(list.len()).unwrap_or(u32::MAX)
+}
+
+/// A placement in f32 if that is exact, else in f64.
+fn pack_placement(entries: &[f64; 12]) -> Bytes {
+    let rounded = entries.map(|entry| entry as f32);
+    if rounded.map(f64::from) == *entries { pack(&rounded) } else { pack(entries) }
 }
 
 fn pack<T: bytemuck::NoUninit>(numbers: &[T]) -> Bytes {

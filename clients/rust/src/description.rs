@@ -111,6 +111,7 @@ impl DescriptionBuilder {
             corner_count: wire.corners as usize,
             triangle_count: wire.triangles as usize,
             hashes,
+            origin: decode_numbers(format!("shape {}: origin", wire.shape), &wire.origin)?.unwrap_or_default(),
             ..Shape::default()
         });
         Ok(())
@@ -156,13 +157,16 @@ impl DescriptionBuilder {
             Some(range) => range.material,
             None => find_material(wire.material)?,
         };
+        let placement = decode_transform(field("placement"), &wire.placement)?;
+        let exact_placement = decode_numbers(field("exact_placement"), &wire.exact_placement)?;
         self.domains.push(Domain {
             index: wire.domain as usize,
             shape,
             rank,
             material,
             material_ranges,
-            placement: decode_transform(field("placement"), &wire.placement)?,
+            placement,
+            exact_placement: exact_placement.unwrap_or_else(|| placement.map(f64::from)),
             attachment,
             follow,
             rest_q,
@@ -222,6 +226,17 @@ impl Shape {
         self.hashes.iter().find(|(candidate, _)| *candidate == array).map(|(_, hash)| *hash)
     }
 
+    /// Whether the shape has an origin: f32 would round x0 too coarsely without one.
+    pub fn has_origin(&self) -> bool {
+        self.origin != [0.0; 3]
+    }
+
+    /// Rest positions that are exact relative to [`Self::origin`]: `centered_positions`, or without an origin
+    /// `rest_positions`. A vertex is at A (v + U q) + (A c + t) for T = (A, t).
+    pub fn local_positions(&self) -> &[f32] {
+        if self.has_origin() { &self.centered_positions } else { &self.rest_positions }
+    }
+
     /// Sets an array to the little-endian numbers in `bytes`. [`SceneDescription::check_arrays`] checks its length.
     ///
     /// # Errors
@@ -235,6 +250,7 @@ impl Shape {
             ShapeArray::Uvs => self.uvs = decode(FIELD, bytes)?,
             ShapeArray::RestNormals => self.rest_normals = decode(FIELD, bytes)?,
             ShapeArray::Modes => self.modes = decode(FIELD, bytes)?,
+            ShapeArray::CenteredPositions => self.centered_positions = decode(FIELD, bytes)?,
             ShapeArray::Unspecified => return Err(malformed_reply("describe.chunk.array", "a known array", 0)),
         }
         Ok(())
@@ -251,6 +267,8 @@ impl Shape {
             ShapeArray::Uvs if self.uvs.is_empty() => (0, 0),
             ShapeArray::Uvs => (self.uvs.len(), 2 * self.corner_count),
             ShapeArray::Modes => (self.modes.len(), 3 * self.vertex_count * self.rank),
+            ShapeArray::CenteredPositions if !self.has_origin() => (self.centered_positions.len(), 0),
+            ShapeArray::CenteredPositions => (self.centered_positions.len(), 3 * self.vertex_count),
             ShapeArray::Unspecified => (0, 0),
         };
         let field = |name: &str| format!("shape {}: {name}", self.index);
@@ -306,6 +324,15 @@ fn check_eigenvalues(field: &str, eigenvalues: &[f64], rank: usize) -> Result<()
 
 fn decode_hash(bytes: &[u8]) -> Result<ContentHash> {
     bytes.try_into().map_err(|_| malformed_reply("describe.sha256", "32 bytes", bytes.len()))
+}
+
+/// A list of `N` numbers; `None` for an empty list.
+fn decode_numbers<const N: usize>(field: String, numbers: &[f64]) -> Result<Option<[f64; N]>> {
+    if numbers.is_empty() {
+        return Ok(None);
+    }
+    let invalid = |_| malformed_reply(field, format!("none or {N} numbers"), numbers.len());
+    numbers.try_into().map(Some).map_err(invalid)
 }
 
 fn decode_transform(field: String, bytes: &[u8]) -> Result<[f32; 12]> {

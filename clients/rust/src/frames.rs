@@ -201,6 +201,9 @@ pub struct Frame {
     pub look: Option<FrameLook>,
     /// How far the lowest vertex lies below the ground, in meters; 0 if none does, and for other outputs than color.
     pub below_ground: f64,
+    /// Whether a picture without a camera of its own frames the domains where they are, because none of them is in the
+    /// view that frames the rest bounds.
+    pub reframed: bool,
 }
 
 /// Antialiasing and shadow map of a frame, chosen by the scene's settings or by the server.
@@ -408,6 +411,7 @@ impl WireChunk for v1::FrameChunk {
             visibility_drawn_by: decode_drawn_by(head.visibility_drawn_by()),
             look: head.look.as_ref().map(decode_look),
             below_ground: head.below_ground,
+            reframed: head.reframed,
             stages: stages::from_wire(head.stages),
         })
     }

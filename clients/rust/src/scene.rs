@@ -59,6 +59,8 @@ pub struct Domain {
     pub follow: Option<Follow>,
     /// `world_from_domain` at rest, row-major 3x4.
     pub placement: [f32; 12],
+    /// `placement` in f64. Differs from it only if the domain is far from the scene's origin.
+    pub exact_placement: [f64; 12],
     /// q at rest: r numbers, or none if all are 0.
     pub rest_q: Vec<f32>,
     /// Index in the scene of an earlier domain, with which this domain shares its coordinates.
@@ -96,6 +98,11 @@ pub struct Shape {
     pub rest_normals: Vec<f32>,
     /// U: 3n x r entries, row-major.
     pub modes: Vec<f32>,
+    /// c, the point that `centered_positions` are relative to, in scene units and in the frame of the domain. Zero
+    /// unless f32 would round x0 too coarsely.
+    pub origin: [f64; 3],
+    /// x0 - c, three numbers per vertex; empty if the shape has no origin.
+    pub centered_positions: Vec<f32>,
 }
 
 /// A Phong material. Colors are linear.

@@ -12,7 +12,7 @@ use crate::engine::output::step_vertices::StepVertices;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{CameraSource, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::PickHit;
 
 /// Identifies a loaded scene on the device thread.
@@ -82,7 +82,7 @@ pub(in crate::engine) enum Command {
     /// Finds the surface points at the pixels of a rectangle.
     Pick {
         id: SceneId,
-        camera: Camera,
+        camera: CameraSource,
         /// Size of the picture that contains the rectangle.
         picture: FrameSize,
         rectangle: PixelRect,

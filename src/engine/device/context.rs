@@ -42,6 +42,8 @@ pub struct EngineInfo {
 pub(in crate::engine) struct PartialAovDraw {
     pub aov: PartialAov,
     legend: Option<Legend>,
+    /// As [`modalcast_render::FrameInfo::is_reframed`].
+    pub is_reframed: bool,
 }
 
 /// Creates the deformer of a scene in tests.
@@ -546,7 +548,8 @@ impl DeviceContext {
             (FrameOutput::Normals, _) => Aov::Normals,
             _ => Aov::Domains,
         };
-        Ok(PartialAovDraw { aov: renderer.begin_aov(loaded_scene.buffers()?, &params, aov)?, legend })
+        let aov = renderer.begin_aov(loaded_scene.buffers()?, &params, aov)?;
+        Ok(PartialAovDraw { aov, legend, is_reframed: false })
     }
 
     /// Submits the next band of an AOV.
@@ -566,7 +569,7 @@ impl DeviceContext {
         scene: &LoadedScene,
         draw: PartialAovDraw,
     ) -> Result<(AovImage, Option<Legend>)> {
-        let PartialAovDraw { aov, legend } = draw;
+        let PartialAovDraw { aov, legend, is_reframed: _ } = draw;
         let renderer = self.renderer.as_mut().map_err(|error| error.clone())?;
         Ok((renderer.finish_aov(scene.buffers()?, aov)?, legend))
     }

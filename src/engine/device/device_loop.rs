@@ -390,8 +390,10 @@ impl DeviceLoop {
     fn pick(&mut self, command: Command) {
         let Command::Pick { id, camera, picture, rectangle, reply } = command else { return };
         let Self { context, scenes, .. } = self;
-        let pending_pick =
-            find_scene(scenes, id).and_then(|scene| context.begin_pick(scene, &camera, picture, rectangle));
+        let pending_pick = find_scene(scenes, id).and_then(|scene| {
+            let camera = camera.resolve(scene.scene(), scene.current_state(), picture).camera;
+            context.begin_pick(scene, &camera, picture, rectangle)
+        });
         match self.loss.record_loss(pending_pick) {
             Ok(pending) => self.picks.push(InFlight { id, pending, charge: None, reply }),
             Err(error) => answer(reply, Err(error)),

@@ -19,7 +19,7 @@ use crate::engine::output::rendered_picture::{Pixels, RenderedPicture};
 use crate::engine::testing;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::Error;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Scene, SceneState};
+use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, Scene, SceneState};
 
 const LARGE: FrameSize = FrameSize::new(192, 512);
 const SMALL: FrameSize = FrameSize::new(32, 32);
@@ -89,7 +89,7 @@ impl Fixture {
     }
 
     fn draw_output(&self, id: SceneId, size: FrameSize, output: FrameOutput) -> PendingReply<Arc<RenderedPicture>> {
-        let camera = Camera::fit_to_scene(&self.scene, size.width, size.height);
+        let camera = CameraSource::framing(&self.scene, size);
         let picture = PictureSpec { camera, size, output, style: FrameStyle::default() };
         self.handle.draw(id, picture, PictureContent::PIXELS)
     }

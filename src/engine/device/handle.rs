@@ -21,7 +21,7 @@ use crate::engine::output::step_vertices::StepVertices;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
-use modalcast_model::scene::{Camera, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::scene::{CameraSource, FrameSize, PixelRect, Scene, SceneState};
 use modalcast_render::PickHit;
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
@@ -176,7 +176,7 @@ impl DeviceHandle {
     pub(in crate::engine) fn pick(
         &self,
         id: SceneId,
-        camera: Camera,
+        camera: CameraSource,
         picture: FrameSize,
         rectangle: PixelRect,
     ) -> PendingReply<Vec<PickHit>> {

@@ -15,7 +15,9 @@ use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer, SharedSt
 use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::fault_injection::{self, InjectionPoint};
 use modalcast_model::raster::{RasterGeometry, Rasterizer};
-use modalcast_model::scene::{BoundingBox, Camera, FloatingOrigins, FrameSize, OrientedBounds, Scene, SceneState};
+use modalcast_model::scene::{
+    BoundingBox, Camera, FloatingOrigins, FrameBounds, FrameSize, OrientedBounds, Scene, SceneState,
+};
 use modalcast_render::{
     FrameInfo, FrameParams, FramePixels, PendingFrame, Renderer, SceneBuffers, SharedFrame, TrialScene,
 };
@@ -110,7 +112,7 @@ impl LoadedScene {
             let expected = format!("vertices within {MAX_COORDINATE:e}");
             return Err(invalid("scene.rest", expected, format!("{:?}", deformed.bounds)));
         }
-        (self.bounds, self.light_bounds) = (deformed.bounds, deformed.oriented_bounds);
+        self.set_bounds(&deformed);
         Ok(())
     }
 
@@ -119,7 +121,8 @@ impl LoadedScene {
         &self.scene
     }
 
-    /// Bounds of the last deformation in scene units, each domain relative to its floating origin. Always finite.
+    /// Bounds of the drawn vertices of the last deformation in scene units, each domain relative to its floating
+    /// origin. Always finite.
     pub const fn bounds(&self) -> BoundingBox {
         self.bounds
     }
@@ -161,13 +164,20 @@ impl LoadedScene {
         }
         let deformed = result.unwrap_or_else(|panic| resume_unwind(panic))?;
         if is_in_range(&deformed.bounds) {
-            (self.bounds, self.light_bounds) = (deformed.bounds, deformed.oriented_bounds);
             self.current_state = Arc::clone(state);
+            self.set_bounds(&deformed);
             return Ok(deformed);
         }
         let overflow_error = self.overflow_error(state);
         self.run_deformer(&Arc::clone(&self.current_state))?;
         Err(overflow_error.unwrap_or_else(|error| error))
+    }
+
+    /// Sets the bounds of the drawn vertices of the current state.
+    fn set_bounds(&mut self, deformed: &DeformSummary) {
+        let computed = FrameBounds { world: deformed.bounds, light: deformed.oriented_bounds };
+        let clipped = self.scene.drawn_bounds.clip(&self.scene, &self.current_state, computed);
+        (self.bounds, self.light_bounds) = (clipped.world, clipped.light);
     }
 
     fn run_deformer(&mut self, state: &Arc<SceneState>) -> Result<DeformSummary> {
@@ -204,6 +214,7 @@ impl LoadedScene {
         let camera_origin = self.scene.origin_grids.snap(camera.eye().into());
         let positions = &self.deformer.surface_with(VertexAttributes::POSITIONS_AND_NORMALS)?.positions;
         let (positions, bounds) = origins.rebase_positions(camera_origin, &self.scene, positions);
+        let bounds = self.scene.drawn_bounds.clip_rebased(&self.scene, &self.current_state, bounds, camera_origin);
         renderer.upload_rebased(buffers, &positions, camera_origin)?;
         Ok(BufferContents { bounds, light_bounds: None, is_uploaded: true })
     }
@@ -230,8 +241,13 @@ impl LoadedScene {
         buffers.set_step(self.generation);
         let has_origin = |step: &SharedStep| uniform_origin(step.origins.as_ref()) == Some(origin);
         let drawable_steps = steps.into_iter().take_while(|step| has_origin(step) && is_in_range(&step.bounds));
-        let frames = drawable_steps.map(|SharedStep { positions, bounds, oriented_bounds: light_bounds, .. }| {
-            let contents = BufferContents { bounds, light_bounds, is_uploaded: false };
+        // The first step is the current one. The bounds of another step cannot be clipped without its state.
+        let drawn_bounds = &self.scene.drawn_bounds;
+        let max_steps = if drawn_bounds.clips() { 1 } else { usize::MAX };
+        let frames = drawable_steps.take(max_steps).map(|SharedStep { positions, bounds, oriented_bounds, .. }| {
+            let computed = FrameBounds { world: bounds, light: oriented_bounds };
+            let clipped = drawn_bounds.clip(&self.scene, &self.current_state, computed);
+            let contents = BufferContents { bounds: clipped.world, light_bounds: clipped.light, is_uploaded: false };
             SharedFrame { params: FrameParams { samples, ..contents.frame_params(*camera, size) }, positions }
         });
         renderer.rasterize(buffers, frames.collect())

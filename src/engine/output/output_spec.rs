@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::frame_format::FrameFormat;
 use modalcast_model::deform::VertexAttributes;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, PixelRect};
+use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, PixelRect};
 
 /// The output that a client requests of a step.
 #[derive(Debug, Clone, PartialEq)]
@@ -14,7 +14,7 @@ pub enum OutputSpec {
     Vertices(VertexAttributes),
     /// The surface points at the pixels of a rectangle.
     Pick {
-        camera: Camera,
+        camera: CameraSource,
         /// Size of the picture that contains the rectangle.
         picture: FrameSize,
         rectangle: PixelRect,
@@ -26,7 +26,7 @@ pub enum OutputSpec {
 /// What a picture shows. Equal pictures of a step have equal pixels.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PictureSpec {
-    pub camera: Camera,
+    pub camera: CameraSource,
     pub size: FrameSize,
     pub output: FrameOutput,
     /// Ignored for outputs other than [`FrameOutput::Color`].

@@ -20,7 +20,7 @@ pub struct RenderedPicture {
     pub pixels: Pixels,
     /// Times of the stages from the upload to the readback.
     pub(super) stages: StageTimes,
-    /// How a color picture was drawn; default for others.
+    /// How a color picture was drawn. For others, only whether the camera was moved.
     pub(super) info: FrameInfo,
     /// At most one entry per format.
     encodings: Mutex<Vec<(FrameFormat, SharedEncoding)>>,
@@ -44,14 +44,15 @@ pub enum Pixels {
 
 impl RenderedPicture {
     /// A picture of an AOV, which has values instead of colors. With a legend (the scale of a color map), the values
-    /// are drawn as colors.
-    pub(in crate::engine) fn from_aov(image: AovImage, legend: Option<Legend>) -> Self {
+    /// are drawn as colors. `is_reframed`: as [`FrameInfo::is_reframed`].
+    pub(in crate::engine) fn from_aov(image: AovImage, legend: Option<Legend>, is_reframed: bool) -> Self {
         let (width, height, stages) = (image.width, image.height, stage_times(&image.times));
         let pixels = match legend {
             Some(legend) => Pixels::ColorMap(image, legend),
             None => Pixels::Values(image.bytes.into()),
         };
-        Self { width, height, pixels, stages, info: FrameInfo::default(), encodings: Mutex::default() }
+        let info = FrameInfo { is_reframed, ..FrameInfo::default() };
+        Self { width, height, pixels, stages, info, encodings: Mutex::default() }
     }
 
     /// The cell for the encoding in a format. The caller encodes the picture if the cell is empty.

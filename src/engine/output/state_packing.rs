@@ -9,8 +9,9 @@ use bytes::Bytes;
 use super::step_output::{OutputBody, StepId, StepOutput};
 use crate::engine::blocking::run_blocking;
 use crate::telemetry::{Stage, StageTimes, ms_since};
+use modalcast_model::domain::Transform;
 use modalcast_model::error::{Result, fault};
-use modalcast_model::scene::{Scene, SceneState};
+use modalcast_model::scene::{FloatingOrigins, Scene, SceneState};
 
 /// The content of a [`StateSection`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,10 +115,11 @@ fn pack(scene: &Scene, state: &SceneState, previous: Option<&SceneState>) -> Sta
     packed.append(StateContent::Q, bytemuck::cast_slice(&q));
     domains.clear();
     let mut transforms = Vec::new();
-    for (root, transform) in state.transforms.iter().enumerate() {
-        if previous.is_none_or(|previous| !are_bits_equal(&transform.0, &previous.transforms[root].0)) {
+    for root in 0..state.transforms.len() {
+        let transform = sent_transform(scene, state, root);
+        if previous.is_none_or(|previous| !are_bits_equal(&transform.0, &sent_transform(scene, previous, root).0)) {
             domains.push(scene.transform_roots.domain(root));
-            transforms.push(*transform);
+            transforms.push(transform);
         }
     }
     if transforms.len() < state.transforms.len() {
@@ -131,6 +133,29 @@ fn pack(scene: &Scene, state: &SceneState, previous: Option<&SceneState>) -> Sta
     packed
 }
 
+/// The transform of a root that acts on x0. That of a root with a pivot has no translation: its origin contains it
+/// ([`sent_origin`]), because its translation from an origin near the domain is as large as the distance of the domain
+/// from the origin of its own frame, which f32 rounds.
+fn sent_transform(scene: &Scene, state: &SceneState, root: usize) -> Transform {
+    let mut transform = state.transforms[root];
+    if scene.transform_roots.pivot_of(root).is_some() {
+        [3, 7, 11].into_iter().for_each(|entry| transform.0[entry] = 0.0);
+    }
+    transform
+}
+
+/// The origin of the [`sent_transform`] of a root, in scene units from the scene's origin.
+fn sent_origin(scene: &Scene, origins: &FloatingOrigins, state: &SceneState, root: usize) -> [f64; 3] {
+    match scene.transform_roots.pivot_of(root) {
+        None => origins.origin_of(root),
+        // With T = (A, t) of the state, (A, t) v = A x0 + t - A p.
+        Some(pivot) => {
+            let moved = state.transforms[root].linear() * nalgebra::Vector3::from(pivot);
+            std::array::from_fn(|axis| origins.translations()[root][axis] - moved[axis])
+        }
+    }
+}
+
 /// Whether two lists have the same bits, so that 0 differs from -0.
 fn are_bits_equal(a: &[f32], b: &[f32]) -> bool {
     bytemuck::cast_slice::<f32, u32>(a) == bytemuck::cast_slice::<f32, u32>(b)
@@ -142,8 +167,12 @@ fn origins_in_meters(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
     let to_meters = |origin: [f64; 3]| std::array::from_fn(|axis| scene.origin[axis] + scene.unit * origin[axis]);
     match &state.origins {
         None => vec![scene.origin],
-        Some(origins) if origins.has_no_outliers() => vec![to_meters(origins.shared_origin())],
-        Some(origins) => (0..state.transforms.len()).map(|root| to_meters(origins.origin_of(root))).collect(),
+        Some(origins) if origins.has_no_outliers() && origins.pivots().is_empty() => {
+            vec![to_meters(origins.shared_origin())]
+        }
+        Some(origins) => {
+            (0..state.transforms.len()).map(|root| to_meters(sent_origin(scene, origins, state, root))).collect()
+        }
     }
 }
 
@@ -151,7 +180,6 @@ fn origins_in_meters(scene: &Scene, state: &SceneState) -> Vec<[f64; 3]> {
 mod tests {
     use super::*;
     use crate::engine::testing;
-    use modalcast_model::domain::Transform;
 
     fn section_bytes(packed: &StateBytes, content: StateContent) -> Option<&[u8]> {
         let section = packed.sections.iter().find(|section| section.content == content)?;

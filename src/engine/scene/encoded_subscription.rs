@@ -144,7 +144,7 @@ mod tests {
     use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
     use crate::engine::output::step_output::{OutputBody, StepOutput};
     use crate::engine::testing;
-    use modalcast_model::scene::{Camera, FrameSize, FrameStyle};
+    use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle};
 
     /// Limit of an [`EncodedSubscription`] that takes all steps.
     const ALL_STEPS: u64 = 0;
@@ -155,7 +155,7 @@ mod tests {
 
     /// Subscribes to one picture of this size.
     fn subscribe_to(size: FrameSize, delivery: Delivery) -> (Subscriber, Subscription) {
-        let camera = Camera::fit_to_scene(&testing::two_strips(), size.width, size.height);
+        let camera = CameraSource::framing(&testing::two_strips(), size);
         let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
         Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
     }

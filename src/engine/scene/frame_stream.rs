@@ -9,7 +9,7 @@ use tokio::sync::{Notify, watch};
 use crate::engine::lock::lock;
 use crate::engine::output::output_spec::PictureSpec;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
-use modalcast_model::scene::{Camera, Scene};
+use modalcast_model::scene::{CameraSource, Scene};
 
 /// Identifies a frame stream. Only the client that opened the stream and the server know it.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
@@ -78,7 +78,7 @@ impl CameraControl {
     }
 
     /// Replaces the cameras of pictures, given by index. Returns the version of the first frame that shows them.
-    pub fn move_cameras(&self, cameras: &[(usize, Camera)]) -> u64 {
+    pub fn move_cameras(&self, cameras: &[(usize, CameraSource)]) -> u64 {
         let mut camera_version = 0;
         self.state.send_modify(|state| {
             let mut pictures = state.pictures.to_vec();
@@ -147,10 +147,10 @@ mod tests {
     use super::*;
     use crate::engine::output::output_spec::FrameOutput;
     use crate::engine::testing;
-    use modalcast_model::scene::{FrameSize, FrameStyle};
+    use modalcast_model::scene::{Camera, FrameSize, FrameStyle};
 
     fn camera_control() -> CameraControl {
-        let camera = Camera::fit_to_scene(&testing::two_strips(), 8, 8);
+        let camera = CameraSource::framing(&testing::two_strips(), FrameSize::new(8, 8));
         let picture = PictureSpec {
             camera,
             size: FrameSize::new(8, 8),
@@ -180,7 +180,7 @@ mod tests {
         let cameras = camera_control();
         let receiver = cameras.receiver();
         let [still, moved] = [0, 1].map(|index: usize| cameras.pictures()[index].camera);
-        let moved = Camera { far: 7.0, near: 1.0, ..moved };
+        let moved = CameraSource::Fixed(Camera { far: 7.0, near: 1.0, ..*moved.at_rest() });
         assert_eq!((cameras.move_cameras(&[(1, still)]), cameras.move_cameras(&[(1, moved)])), (1, 2));
         let state = receiver.borrow().clone();
         assert_eq!((state.pictures[0].camera, state.pictures[1].camera, state.camera_version), (still, moved, 2));

@@ -16,7 +16,7 @@ use super::upload::CompleteUpload;
 use super::upload_folder::UploadFolder;
 use crate::engine::content::ContentHash;
 use crate::engine::upload_quota::UploadPermit;
-use modalcast_model::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, Shape, Transform};
+use modalcast_model::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, RestOrigin, Shape};
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::UpAxis;
@@ -45,10 +45,18 @@ pub struct ArrayUploadHeader {
 }
 
 /// The mesh and the modes of a domain.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum UploadedShape {
     /// Arrays of these sizes follow.
-    Arrays { vertices: u32, triangles: u32, rank: u32 },
+    Arrays {
+        vertices: u32,
+        triangles: u32,
+        rank: u32,
+        /// Whether the rest positions are f64 instead of f32.
+        f64_positions: bool,
+        /// The point that the rest positions are relative to.
+        origin: [f64; 3],
+    },
     /// The arrays of an earlier domain, given by its index.
     OfDomain(u32),
 }
@@ -58,8 +66,8 @@ pub enum UploadedShape {
 pub struct UploadedDomain {
     pub name: String,
     pub shape: UploadedShape,
-    /// `world_from_domain` at rest.
-    pub placement: Transform,
+    /// `world_from_domain` at rest: 3x4, row-major, in the range of f32.
+    pub placement: [f64; 12],
     /// Linear red, green and blue.
     pub color: [f32; 3],
     /// Empty, or one eigenvalue (omega^2) per mode.
@@ -92,8 +100,9 @@ pub struct ArrayUpload {
     hashes: BTreeMap<String, ContentHash>,
 }
 
-/// Copies of the arrays of a domain that are made when they are validated: as numbers, in a mesh, and in columns.
-const VALIDATED_COPIES: u64 = 3;
+/// Copies of the arrays of a domain that are made when they are validated: as numbers (positions in f64), in a mesh,
+/// and in columns.
+const VALIDATED_COPIES: u64 = 4;
 
 /// A new file of the upload that is hashed while it is written.
 #[derive(Debug)]
@@ -122,6 +131,9 @@ struct OpenArrays {
     domain: u32,
     vertices: usize,
     rank: usize,
+    f64_positions: bool,
+    /// The point that the positions are relative to.
+    origin: [f64; 3],
     /// Sizes in bytes: positions, faces and modes.
     sizes: [u64; 3],
     /// Grows with the received chunks, so that a declared size alone takes no memory.
@@ -129,8 +141,9 @@ struct OpenArrays {
 }
 
 impl OpenArrays {
-    /// Arrays with the given numbers of vertices, triangles and modes.
-    fn new(domain: u32, [vertices, triangles, rank]: [u32; 3]) -> Result<Self> {
+    /// The arrays of a domain. `None` if the domain uses those of another one.
+    fn new(domain: u32, shape: UploadedShape) -> Result<Option<Self>> {
+        let UploadedShape::Arrays { vertices, triangles, rank, f64_positions, origin } = shape else { return Ok(None) };
         if vertices == 0 || triangles == 0 {
             let given = format!("{vertices} vertices, {triangles} triangles");
             return Err(invalid("vertices", "at least one vertex and one triangle", given));
@@ -138,9 +151,28 @@ impl OpenArrays {
         if rank as usize > MAX_RANK {
             return Err(invalid("rank", format!("0 to {MAX_RANK}"), rank));
         }
+        if !origin.iter().all(|coordinate| (*coordinate as f32).is_finite()) {
+            return Err(invalid("origin", "finite numbers in the range of f32", format!("{origin:?}")));
+        }
         // At most 2^32 vertices x 3 x 4 bytes x 512 modes, which fits in 64 bits.
-        let sizes = [u64::from(vertices), u64::from(triangles), u64::from(vertices) * u64::from(rank)].map(|n| 12 * n);
-        Ok(Self { domain, vertices: vertices as usize, rank: rank as usize, sizes, bytes: Vec::new() })
+        let mut sizes =
+            [u64::from(vertices), u64::from(triangles), u64::from(vertices) * u64::from(rank)].map(|n| 12 * n);
+        sizes[0] *= if f64_positions { 2 } else { 1 };
+        let (vertices, rank) = (vertices as usize, rank as usize);
+        Ok(Some(Self { domain, vertices, rank, f64_positions, origin, sizes, bytes: Vec::new() }))
+    }
+
+    /// x0 of all vertices. `bytes` are the positions as they were received.
+    fn rest_positions(&self, bytes: &[u8]) -> Vec<[f64; 3]> {
+        let positions: Vec<[f64; 3]> = match self.f64_positions {
+            true => bytemuck::pod_collect_to_vec(bytes),
+            false => {
+                let positions: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(bytes);
+                positions.into_iter().map(|position| position.map(f64::from)).collect()
+            }
+        };
+        let x0 = |position: [f64; 3]| std::array::from_fn(|axis| position[axis] + self.origin[axis]);
+        positions.into_iter().map(x0).collect()
     }
 
     fn total(&self) -> u64 {
@@ -215,8 +247,8 @@ impl ArrayUpload {
         }
         let path = format!("domains[{index}]");
         self.add_domain(index, domain).map_err(|error| error.in_message(&path))?;
-        let UploadedShape::Arrays { vertices, triangles, rank } = domain.shape else { return Ok(()) };
-        let arrays = OpenArrays::new(index, [vertices, triangles, rank]).map_err(|error| error.in_message(&path))?;
+        let arrays = OpenArrays::new(index, domain.shape).map_err(|error| error.in_message(&path))?;
+        let Some(arrays) = arrays else { return Ok(()) };
         self.declared_bytes = self.declared_bytes.saturating_add(arrays.total());
         if self.declared_bytes > self.header.total_bytes {
             return Err(invalid("header.total_bytes", self.header.total_bytes.to_string(), self.declared_bytes));
@@ -272,7 +304,7 @@ impl ArrayUpload {
             "\n[[domain]]\nname = {}\nmodel = \"{shape}.obj\"\nmodes = \"{modes}\"\nup = \"{up}\"\nplacement.matrix = {:?}\n\
              material.diffuse = {:?}\ncrease_angle = {:?}\n",
             toml_string(&domain.name),
-            domain.placement.0.map(f64::from),
+            domain.placement,
             domain.color.map(f64::from),
             crease_angle.degrees(),
         );
@@ -335,7 +367,7 @@ impl ArrayUpload {
     fn write_arrays(&mut self, arrays: &OpenArrays) -> Result<()> {
         let (positions, remainder) = arrays.bytes.split_at(arrays.sizes[0] as usize);
         let (faces, modes) = remainder.split_at(arrays.sizes[1] as usize);
-        let positions: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(positions);
+        let positions = arrays.rest_positions(positions);
         let faces: Vec<[u32; 3]> = bytemuck::pod_collect_to_vec(faces);
         let modes: Vec<f32> = bytemuck::pod_collect_to_vec(modes);
         check_arrays(arrays, &positions, &faces, &modes)?;
@@ -396,19 +428,30 @@ impl ArrayUpload {
 }
 
 /// Validates arrays with the constructors that the loaders also use.
-fn check_arrays(arrays: &OpenArrays, positions: &[[f32; 3]], faces: &[[u32; 3]], modes: &[f32]) -> Result<()> {
+fn check_arrays(arrays: &OpenArrays, positions: &[[f64; 3]], faces: &[[u32; 3]], modes: &[f32]) -> Result<()> {
     let vertices = (0..arrays.vertices as u32).collect();
     let corners = Corners { vertices, normals: vec![[0.0, 0.0, 1.0]; arrays.vertices], uvs: Vec::new() };
-    let mesh = Mesh::new(positions.to_vec(), corners, faces.to_vec())?;
+    // The loader accepts positions in the range of f32.
+    let rounded_positions = positions.iter().map(|position| position.map(|number| number as f32)).collect();
+    let mesh = Mesh::new(rounded_positions, corners, faces.to_vec())?;
     let modes = Modes::from_rows(3 * arrays.vertices, arrays.rank, modes)?;
     Shape::new(mesh, modes).map(drop)
 }
 
-/// Writes a triangle mesh. `{:?}` prints f32 with all digits that they need. Indices of OBJ files begin at 1.
-fn write_obj(file: &mut impl Write, positions: &[[f32; 3]], faces: &[[u32; 3]]) -> io::Result<()> {
+/// Writes a triangle mesh. `{:?}` prints numbers with all digits that they need: those of f32, or of f64 if the loader
+/// reads the positions relative to an origin. Indices of OBJ files begin at 1.
+fn write_obj(file: &mut impl Write, positions: &[[f64; 3]], faces: &[[u32; 3]]) -> io::Result<()> {
     writeln!(file, "mtllib surface.mtl\nusemtl surface")?;
-    for [x, y, z] in positions {
-        writeln!(file, "v {x:?} {y:?} {z:?}")?;
+    let drawn = faces.as_flattened().iter().map(|vertex| *vertex as usize);
+    let rest = RestOrigin::choose(positions, drawn);
+    if rest.origin == [0.0; 3] {
+        for [x, y, z] in rest.positions {
+            writeln!(file, "v {x:?} {y:?} {z:?}")?;
+        }
+    } else {
+        for [x, y, z] in positions {
+            writeln!(file, "v {x:?} {y:?} {z:?}")?;
+        }
     }
     for face in faces {
         let [a, b, c] = face.map(|vertex| u64::from(vertex) + 1);

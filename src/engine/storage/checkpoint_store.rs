@@ -41,6 +41,9 @@ const MAGIC: &[u8; 8] = b"MCSTEP01";
 /// Magic number of a checkpoint with floating origins, the points that transforms are relative to. Between the
 /// transforms and the hash, the file contains the shared origin (3 f64) and one translation (3 f64) per transform.
 const MAGIC_ORIGINS: &[u8; 8] = b"MCSTEP02";
+/// Magic number of a checkpoint with pivots, the points that the transforms map to their translations. After the
+/// translations, the file contains one pivot (3 f64) per transform.
+const MAGIC_PIVOTS: &[u8; 8] = b"MCSTEP03";
 /// The magic number and five numbers of 8 bytes.
 const HEADER_BYTES: usize = 8 + 5 * 8;
 const HASH_BYTES: usize = 32;
@@ -284,7 +287,11 @@ fn checkpoint_path(folder: &Path, name: &str) -> PathBuf {
 fn encode(state: &SceneState) -> Vec<u8> {
     let size = HEADER_BYTES + 4 * state.q.len() + TRANSFORM_BYTES * state.transforms.len() + HASH_BYTES;
     let mut bytes = Vec::with_capacity(size);
-    bytes.extend_from_slice(if state.origins.is_some() { MAGIC_ORIGINS } else { MAGIC });
+    bytes.extend_from_slice(match &state.origins {
+        None => MAGIC,
+        Some(origins) if origins.pivots().is_empty() => MAGIC_ORIGINS,
+        Some(_) => MAGIC_PIVOTS,
+    });
     bytes.extend_from_slice(&state.run.to_le_bytes());
     bytes.extend_from_slice(&state.step.to_le_bytes());
     bytes.extend_from_slice(&state.time.to_le_bytes());
@@ -294,8 +301,8 @@ fn encode(state: &SceneState) -> Vec<u8> {
     bytes.extend(state.q.iter().copied().chain(transforms).flat_map(f32::to_le_bytes));
     if let Some(origins) = &state.origins {
         let shared = origins.shared_origin();
-        let translations = origins.translations().as_flattened();
-        bytes.extend(shared.iter().chain(translations).flat_map(|number| number.to_le_bytes()));
+        let (translations, pivots) = (origins.translations().as_flattened(), origins.pivots().as_flattened());
+        bytes.extend(shared.iter().chain(translations).chain(pivots).flat_map(|number| number.to_le_bytes()));
     }
     let hash = Sha256::digest(&bytes);
     bytes.extend_from_slice(&hash);
@@ -304,8 +311,10 @@ fn encode(state: &SceneState) -> Vec<u8> {
 
 fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     let rest_state = SceneState::rest(scene);
-    let has_origins = bytes.starts_with(MAGIC_ORIGINS);
-    let origin_bytes = if has_origins { POINT_BYTES * (1 + rest_state.transforms.len()) } else { 0 };
+    let has_pivots = bytes.starts_with(MAGIC_PIVOTS);
+    let has_origins = bytes.starts_with(MAGIC_ORIGINS) || has_pivots;
+    let points_per_root = usize::from(has_origins) + usize::from(has_pivots);
+    let origin_bytes = POINT_BYTES * (usize::from(has_origins) + points_per_root * rest_state.transforms.len());
     let q_bytes = 4 * rest_state.q.len();
     let transform_bytes = TRANSFORM_BYTES * rest_state.transforms.len();
     let file_size = HEADER_BYTES + q_bytes + transform_bytes + origin_bytes + HASH_BYTES;
@@ -336,7 +345,10 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     let f32_from_bytes = |word: &[u8]| f32::from_le_bytes([word[0], word[1], word[2], word[3]]);
     let transform = |bytes: &[u8]| Transform(std::array::from_fn(|entry| f32_from_bytes(&bytes[4 * entry..])));
     let mut transforms: Vec<Transform> = transforms.chunks_exact(TRANSFORM_BYTES).map(transform).collect();
-    let origins = if has_origins { Some(decode_origins(origins, scene)?) } else { None };
+    let origins = match has_origins || scene.is_far {
+        true => Some(decode_origins(origins, scene, &transforms)?),
+        false => None,
+    };
     if let Some(origins) = &origins {
         // The file may come from a version with other floating origins.
         let rebased = transforms.iter().enumerate().map(|(root, transform)| origins.rebase_transform(root, *transform));
@@ -353,8 +365,9 @@ fn decode(bytes: &[u8], scene: &Scene) -> Result<SceneState> {
     })
 }
 
-/// Decodes the shared origin, then the translations.
-fn decode_origins(bytes: &[u8], scene: &Scene) -> Result<FloatingOrigins> {
+/// Decodes the shared origin, the translations and the pivots. A file from a version without pivots has none, and a
+/// file without origins has transforms relative to the scene's origin.
+fn decode_origins(bytes: &[u8], scene: &Scene, transforms: &[Transform]) -> Result<FloatingOrigins> {
     let point_from_bytes = |bytes: &[u8]| {
         std::array::from_fn(|axis| {
             let mut word = [0; 8];
@@ -362,9 +375,14 @@ fn decode_origins(bytes: &[u8], scene: &Scene) -> Result<FloatingOrigins> {
             f64::from_le_bytes(word)
         })
     };
-    let (shared, translations) = bytes.split_at(POINT_BYTES);
-    let translations = translations.chunks_exact(POINT_BYTES).map(point_from_bytes).collect();
-    FloatingOrigins::restore(scene, point_from_bytes(shared), translations)
+    let mut points = bytes.chunks_exact(POINT_BYTES).map(point_from_bytes);
+    let shared_origin = points.next().unwrap_or_default();
+    let mut translations: Vec<[f64; 3]> = match bytes {
+        [] => transforms.iter().map(|transform| transform.translation().into()).collect(),
+        _ => points.by_ref().take(transforms.len()).collect(),
+    };
+    FloatingOrigins::change_pivots(scene, transforms, &points.collect::<Vec<_>>(), &mut translations);
+    FloatingOrigins::restore(scene, shared_origin, translations)
 }
 
 #[cfg(test)]

@@ -349,8 +349,14 @@ impl Recorder {
         for index in 0..domains {
             let domain = UploadedDomain {
                 name: format!("triangle {index}"),
-                shape: UploadedShape::Arrays { vertices: 3, triangles: 1, rank: 0 },
-                placement: Transform::IDENTITY,
+                shape: UploadedShape::Arrays {
+                    vertices: 3,
+                    triangles: 1,
+                    rank: 0,
+                    f64_positions: false,
+                    origin: [0.0; 3],
+                },
+                placement: Transform::IDENTITY.0.map(f64::from),
                 color: [1.0; 3],
                 eigenvalues: Vec::new(),
                 crease_angle: None,

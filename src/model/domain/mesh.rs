@@ -102,6 +102,19 @@ impl Mesh {
         &self.triangles
     }
 
+    /// The rest positions of the vertices that triangles use, one per use. Only these vertices are drawn: bounds,
+    /// ground and cameras ignore the others.
+    pub fn drawn_positions(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
+        let position = |corner: &u32| self.rest_positions[self.corners.vertices[*corner as usize] as usize];
+        self.triangles.as_flattened().iter().map(position)
+    }
+
+    /// The same mesh with other rest positions, one per vertex.
+    pub(crate) fn with_rest_positions(self, rest_positions: Vec<[f32; 3]>) -> Result<Self> {
+        check_finite("mesh.positions", &rest_positions)?;
+        Ok(Self { rest_positions, ..self })
+    }
+
     /// For each triangle, bit i is 1 if the edge opposite to its corner i is inside of a polygon, such as the diagonal
     /// of a quadrilateral. Empty if there is no such edge.
     pub fn inner_edges(&self) -> &[u8] {

@@ -9,6 +9,7 @@ mod jpeg_memory;
 mod material;
 mod mesh;
 mod modes;
+mod rest_origin;
 mod smoothing_groups;
 mod tangents;
 mod texture;
@@ -19,17 +20,25 @@ pub use creases::{CreaseAngle, CreasedCorners, split_at_creases};
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
+pub use rest_origin::{MAX_DIAGONALS, RestOrigin};
+pub(crate) use rest_origin::{origin_of_bounds, power_of_two_at_most, snap_to_grid};
 pub use smoothing_groups::{MAX_RING_TRIANGLES, RING_START, SmoothingGroups};
 pub use texture::Texture;
 pub use transform::Transform;
 
 use std::collections::BTreeMap;
 
+use nalgebra::Matrix4;
+
 /// A mesh with its modes. Domains that are instances of one object share a shape.
 #[derive(Debug, Clone)]
 pub struct Shape {
+    /// Its rest positions are relative to [`Self::origin`].
     pub mesh: Mesh,
     pub modes: Modes,
+    /// c, the point that the rest positions of `mesh` are relative to, in scene units and in the frame of the domain:
+    /// x0 = c + v for a rest position v of the mesh. Zero unless f32 would round x0 too coarsely.
+    origin: [f64; 3],
     /// Per corner, the unit tangent and the sign of the bitangent. Empty unless a normal map needs them.
     pub(crate) tangents: Vec<[f32; 4]>,
     /// Present if normals are computed from the deformed triangles.
@@ -49,7 +58,38 @@ impl Shape {
                 3 * modes.vertices(),
             ));
         }
-        Ok(Self { mesh, modes, tangents: Vec::new(), smoothing: None })
+        Ok(Self { mesh, modes, origin: [0.0; 3], tangents: Vec::new(), smoothing: None })
+    }
+
+    /// The shape with rest positions relative to `origin`, in scene units.
+    #[must_use]
+    pub fn with_origin(self, origin: [f64; 3]) -> Self {
+        Self { origin, ..self }
+    }
+
+    /// c, the point that the rest positions of the mesh are relative to: x0 = c + v. Zero for most shapes.
+    pub const fn origin(&self) -> [f64; 3] {
+        self.origin
+    }
+
+    /// Whether the rest positions are relative to a point other than the origin of the domain's frame.
+    pub fn is_centered(&self) -> bool {
+        self.origin != [0.0; 3]
+    }
+
+    /// x0 of all vertices in f64.
+    pub fn exact_positions(&self) -> impl Iterator<Item = [f64; 3]> + '_ {
+        let exact = |v: &[f32; 3]| std::array::from_fn(|axis| f64::from(v[axis]) + self.origin[axis]);
+        self.mesh.rest_positions().iter().map(exact)
+    }
+
+    /// Changes the origin of the rest positions. The vertices stay where they are, up to rounding to f32.
+    pub(crate) fn set_origin(&mut self, origin: [f64; 3]) -> crate::error::Result<()> {
+        let relative = |x0: [f64; 3]| std::array::from_fn(|axis| (x0[axis] - origin[axis]) as f32);
+        let rest_positions = self.exact_positions().map(relative).collect();
+        self.mesh = self.mesh.clone().with_rest_positions(rest_positions)?;
+        self.origin = origin;
+        Ok(())
     }
 
     /// Per corner, the unit tangent (xyz) and the sign of the bitangent (w). Empty if no normal map needs them.
@@ -127,6 +167,9 @@ pub struct Domain {
     /// `world_from_domain` at rest. [`crate::scene::Scene::new`] replaces the placement of a follower by the placement
     /// of its root (the last domain in the chain of followed domains) times the follower's frame relative to the root.
     pub placement: Transform,
+    /// The parts of the entries of `placement` that rounding to f32 has removed. [`crate::scene::Scene::new`] sets them
+    /// to zero if they do not matter, that is, unless the domain is far from the scene's origin.
+    pub placement_remainder: [f64; 12],
     pub attachment: Option<Attachment>,
     /// Present if the domain moves with another one. Steps cannot set the transform of such a domain.
     pub follows: Option<FollowConstraint>,
@@ -146,12 +189,38 @@ impl Domain {
             material: 0,
             material_ranges: vec![],
             placement: Transform::IDENTITY,
+            placement_remainder: [0.0; 12],
             attachment: None,
             follows: None,
             rest_q: vec![],
             shares_q_with: None,
             metadata: Metadata::default(),
         }
+    }
+
+    /// `world_from_domain` at rest in f64.
+    pub fn placement_matrix(&self) -> Matrix4<f64> {
+        let mut matrix = self.placement.to_matrix();
+        for (entry, remainder) in self.placement_remainder.iter().enumerate() {
+            matrix[(entry / 4, entry % 4)] += remainder;
+        }
+        matrix
+    }
+
+    /// Sets `world_from_domain` at rest in f64.
+    pub fn set_placement(&mut self, world_from_domain: &Matrix4<f64>) {
+        self.set_rounded_placement(Transform::from_matrix(world_from_domain), world_from_domain);
+    }
+
+    /// Sets `world_from_domain` at rest in f32, and in f64 for domains that are far from the scene's origin.
+    pub(crate) fn set_rounded_placement(&mut self, rounded: Transform, world_from_domain: &Matrix4<f64>) {
+        self.placement = rounded;
+        let matrix = rounded.to_matrix();
+        let remainder = |entry: usize| {
+            let index = (entry / 4, entry % 4);
+            world_from_domain[index] - matrix[index]
+        };
+        self.placement_remainder = std::array::from_fn(remainder);
     }
 
     /// Indices of the materials of the domain's triangles: one per range, or `material` if there are no ranges.

@@ -16,6 +16,11 @@
 //!   these defaults.
 //! - Normals of a file are kept. Missing normals are smooth except along creases, which split the corners of a vertex
 //!   but not the vertex itself (module `domain::creases`).
+//! - Positions are read as f64. A mesh that is far from the origin of its file, in terms of its own size, is centered
+//!   before its positions are rounded to f32 ([`crate::domain::Shape::origin`]). Creases and normals are computed after
+//!   that.
+//! - Vertices that no face uses are kept, because the rows of U include them, but bounds, ground and cameras
+//!   ignore them.
 //! - Values out of range: module `values` has the table that all formats share.
 //! - A file that does not exist although another file refers to it, and an image that is no PNG, JPEG or WebP image, are
 //!   replaced by a default with a remark. In strict mode, they are errors.
@@ -24,6 +29,8 @@ mod asset_dir;
 mod conversion;
 #[cfg(test)]
 mod dataset_tests;
+#[cfg(test)]
+mod far_tests;
 mod file_hashes;
 mod folder_listing;
 mod gltf;

@@ -78,7 +78,7 @@ fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<Pa
     let _building_memory = files.reserve_temporary("mesh of the arrays", building_bytes)?;
     let mut polygons = PolygonMesh::with_one_material(Vec::new());
     polygons.memory = Some(files.reserve_temporary("lists of the mesh", sizes.list_bytes())?);
-    polygons.positions = read_vectors::<3>(&mut archive, "vertices")?;
+    polygons.positions = read_positions(&mut archive)?;
     polygons.normals = read_vectors::<3>(&mut archive, "normals")?;
     polygons.uvs = read_vectors::<2>(&mut archive, "uvs")?;
     polygons.colors = read_colors(&mut archive)?;
@@ -179,7 +179,7 @@ impl ArraySizes {
     /// Largest memory in bytes of the lists of a [`PolygonMesh`].
     fn list_bytes(&self) -> u64 {
         let normals = if self.has_corner_normals { self.corners() } else { self.vertices };
-        polygons::list_bytes(2 * self.vertices + normals, self.vertices, self.faces, self.corners())
+        polygons::list_bytes(self.vertices, self.vertices + normals, self.vertices, self.faces, self.corners())
     }
 }
 
@@ -312,6 +312,12 @@ fn read_entries(archive: &mut NpzArchive<'_>, name: &str) -> Result<Option<(Vec<
 fn read_vectors<const N: usize>(archive: &mut NpzArchive<'_>, name: &str) -> Result<Vec<[f32; N]>> {
     let Some((_, entries)) = read_entries(archive, name)? else { return Ok(Vec::new()) };
     Ok(entries.as_chunks::<N>().0.iter().map(|row| row.map(|entry| entry as f32)).collect())
+}
+
+/// Reads the rest positions. Empty if the archive has no vertices.
+fn read_positions(archive: &mut NpzArchive<'_>) -> Result<Vec<[f64; 3]>> {
+    let Some((_, entries)) = read_entries(archive, "vertices")? else { return Ok(Vec::new()) };
+    Ok(entries.as_chunks::<3>().0.iter().map(|row| row.map(polygons::within_f32)).collect())
 }
 
 /// Reads the colors. The fourth channel is not used.

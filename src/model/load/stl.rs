@@ -14,7 +14,7 @@ use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, PolygonMesh};
 use super::surface::{self, ModelOptions};
 use super::text::{lines, without_byte_order_mark};
-use crate::domain::Material;
+use crate::domain::{Material, RestOrigin};
 use crate::error::{Result, invalid};
 use crate::memory::TemporaryReservation;
 use crate::scene::{SceneParts, UpAxis};
@@ -83,14 +83,17 @@ fn parse_binary(triangles: &[u8], merger: &mut VertexMerger) -> Result<()> {
             ])
         };
         let vertices = [0, 3, 6].map(|first| [coordinate(first), coordinate(first + 1), coordinate(first + 2)]);
+        let vertices = vertices.map(|vertex| vertex.map(f64::from));
         merger.add_triangle(vertices, index).map_err(|error| error.prefix_field(&format!("triangle {index}")))?;
     }
     Ok(())
 }
 
-/// Parses the `vertex` lines between each `outer loop` and `endloop`. The other words are not needed.
+/// Parses the `vertex` lines between each `outer loop` and `endloop`. The other words are not needed. Vertices are
+/// merged after all of them are known, because f32 coordinates are compared relative to an origin near the mesh.
 fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
-    let mut vertices: Vec<[f32; 3]> = Vec::new();
+    let mut vertices: Vec<[f64; 3]> = Vec::new();
+    let (mut positions, mut line_numbers) = (Vec::new(), Vec::new());
     let mut is_in_loop = false;
     for (index, line) in lines(bytes).enumerate() {
         let location = format_args!("line {}", index + 1).to_string();
@@ -99,7 +102,7 @@ fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
         match key.as_slice() {
             b"outer" => (vertices.clear(), is_in_loop = true).0,
             b"vertex" if is_in_loop && vertices.len() < 3 => {
-                let number = |word: Option<&[u8]>| std::str::from_utf8(word?).ok()?.parse::<f32>().ok();
+                let number = |word: Option<&[u8]>| std::str::from_utf8(word?).ok()?.parse::<f64>().ok();
                 let [x, y, z] = [words.next(), words.next(), words.next()].map(number);
                 let (Some(x), Some(y), Some(z)) = (x, y, z) else {
                     let given = String::from_utf8_lossy(line.trim_ascii()).chars().take(80).collect::<String>();
@@ -111,7 +114,9 @@ fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
                 let [a, b, c] = vertices[..] else {
                     return Err(invalid(location, "three vertices in a loop", vertices.len()));
                 };
-                merger.add_triangle([a, b, c], index + 1).map_err(|error| error.prefix_field(&location))?;
+                check_finite(&vertices).map_err(|error| error.prefix_field(&location))?;
+                positions.extend([a, b, c]);
+                line_numbers.push(index + 1);
                 is_in_loop = false;
             }
             b"vertex" | b"endloop" => return Err(invalid(location, "a loop of three vertices", "another statement")),
@@ -122,29 +127,42 @@ fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
             }
         }
     }
-    match is_in_loop {
-        true => Err(invalid("end", "endloop", "the end of the file")),
-        false => Ok(()),
+    if is_in_loop {
+        return Err(invalid("end", "endloop", "the end of the file"));
+    }
+    merger.origin = RestOrigin::choose(&positions, 0..positions.len()).origin;
+    for (vertices, line) in positions.as_chunks::<3>().0.iter().zip(line_numbers) {
+        merger.add_triangle(*vertices, line).map_err(|error| error.prefix_field(&format!("line {line}")))?;
+    }
+    Ok(())
+}
+
+/// Rejects coordinates that are not numbers in the range of f32.
+fn check_finite(vertices: &[[f64; 3]]) -> Result<()> {
+    match vertices.as_flattened().iter().find(|number| !(**number as f32).is_finite()) {
+        None => Ok(()),
+        Some(number) => Err(invalid("vertex", "finite numbers", number)),
     }
 }
 
-/// Numbers vertices by the first occurrence of their coordinates.
+/// Numbers vertices by the first occurrence of their f32 coordinates.
 #[derive(Default)]
 struct VertexMerger {
     polygons: PolygonMesh,
+    /// The point that the compared coordinates are relative to. Zero for binary files, whose coordinates are f32.
+    origin: [f64; 3],
     index_of: HashMap<[u32; 3], u32>,
 }
 
 impl VertexMerger {
-    fn add_triangle(&mut self, vertices: [[f32; 3]; 3], place: usize) -> Result<()> {
-        if let Some(number) = vertices.as_flattened().iter().find(|number| !number.is_finite()) {
-            return Err(invalid("vertex", "finite numbers", number));
-        }
+    fn add_triangle(&mut self, vertices: [[f64; 3]; 3], place: usize) -> Result<()> {
+        check_finite(&vertices)?;
         let corners = vertices.map(|position| {
             // The sum with 0 changes -0 to 0, which is equal but has other bits.
             let position = position.map(|number| number + 0.0);
+            let compared: [f32; 3] = std::array::from_fn(|axis| (position[axis] - self.origin[axis]) as f32);
             let positions = &mut self.polygons.positions;
-            Corner::of_vertex(*self.index_of.entry(position.map(f32::to_bits)).or_insert_with(|| {
+            Corner::of_vertex(*self.index_of.entry(compared.map(f32::to_bits)).or_insert_with(|| {
                 positions.push(position);
                 positions.len() as u32 - 1
             }))

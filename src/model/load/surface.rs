@@ -67,6 +67,7 @@ pub(super) fn add_domain(
         }
     };
     let shape = Shape::new(mesh, loaded.modes).map_err(in_file(modes_file.as_deref().unwrap_or(name)))?;
+    let shape = shape.with_origin(triangles.origin);
     let mut notes = super::vega_config::read_notes(files, name)?;
     notes.extend(modes_file.map(|file| (modes::FILE_NOTE.to_owned(), file)));
     parts.shapes.push(shape);

@@ -25,8 +25,8 @@
 
 use std::sync::Arc;
 
-use super::{BoundingBox, Scene, TransformRoots};
-use crate::domain::{Domain, Shape, Transform};
+use super::{BoundingBox, Scene, TransformRoots, far_domains};
+use crate::domain::{Domain, Shape, Transform, power_of_two_at_most, snap_to_grid};
 use crate::error::{Result, invalid};
 
 /// The distance of a domain from the shared origin, per axis and in multiples of the domain's spacing, beyond which the
@@ -49,6 +49,8 @@ pub struct OriginGrids {
     spacings: Vec<f64>,
     /// The smallest spacing.
     finest: f64,
+    /// Per root, its pivot ([`TransformRoots::pivot_of`]). Empty if all are zero.
+    pivots: Vec<[f64; 3]>,
 }
 
 impl OriginGrids {
@@ -56,10 +58,8 @@ impl OriginGrids {
     /// positions of the root and its followers in the frame of the root. It is the diagonal of their bounds or, if
     /// larger, their largest coordinate, because f32 rounds relative to the coordinate.
     pub(super) fn new(shapes: &[Shape], domains: &[Domain], transform_roots: &TransformRoots) -> Self {
-        let shape_bounds: Vec<BoundingBox> = shapes
-            .iter()
-            .map(|shape| BoundingBox::from_positions(shape.mesh.rest_positions().as_flattened()))
-            .collect();
+        let shape_bounds: Vec<BoundingBox> =
+            shapes.iter().map(|shape| far_domains::drawn_bounds(&shape.mesh, [0.0; 3])).collect();
         let mut bounds = vec![BoundingBox::EMPTY; transform_roots.count()];
         for (index, domain) in domains.iter().enumerate() {
             let root_bounds = &mut bounds[transform_roots.root_of(index)];
@@ -71,16 +71,13 @@ impl OriginGrids {
                     .for_each(|corner| root_bounds.include(frame.transform_point(corner).coords.into())),
             }
         }
-        Self::from_sizes(bounds.iter().map(|bounds| {
+        let sizes = bounds.iter().map(|bounds| {
             let coordinates = bounds.min.iter().chain(&bounds.max);
             coordinates.fold(bounds.diagonal(), |size: f64, coordinate| size.max(coordinate.abs()))
-        }))
-    }
-
-    fn from_sizes(sizes: impl Iterator<Item = f64>) -> Self {
+        });
         let spacings: Vec<f64> = sizes.map(power_of_two_at_most).collect();
         let finest = spacings.iter().copied().fold(f64::INFINITY, f64::min);
-        Self { spacings, finest }
+        Self { spacings, finest, pivots: transform_roots.pivots().to_vec() }
     }
 
     /// Spacing of the floating origins of a root in scene units.
@@ -90,7 +87,7 @@ impl OriginGrids {
 
     /// The point nearest to `point` on the finest grid of all roots.
     pub fn snap(&self, point: [f64; 3]) -> [f64; 3] {
-        snap_to_grid(point, self.finest)
+        point.map(|coordinate| snap_to_grid(coordinate, self.finest))
     }
 
     /// Whether a root at `translation` is farther than `reach` spacings from `origin` along an axis.
@@ -98,13 +95,6 @@ impl OriginGrids {
         let max_distance = reach * self.spacings[root];
         subtract(translation, origin).iter().any(|coordinate| coordinate.abs() > max_distance)
     }
-}
-
-/// The largest power of two that is at most `size`; 1 for a size that is not a positive normal number.
-fn power_of_two_at_most(size: f64) -> f64 {
-    // The exponent bits of a normal number, without its fraction.
-    let exponent_bits = 0x7FF0_0000_0000_0000;
-    if size.is_normal() && size > 0.0 { f64::from_bits(size.to_bits() & exponent_bits) } else { 1.0 }
 }
 
 /// Numbers of roots that are far from the shared origin. The order compares outliers first; fewer are better.
@@ -145,6 +135,19 @@ impl FloatingOrigins {
         Self::with_shared_origin(grids, [0.0; 3], translations)
     }
 
+    /// Floating origins of the rest state, for a scene that is far from its origin. [`Self::rebase_transform`] makes
+    /// the transforms relative to these floating origins.
+    pub(super) fn at_rest(scene: &Scene) -> Self {
+        let roots = scene.transform_roots.domains().enumerate();
+        let translation = |(root, domain): (usize, u32)| {
+            let pivot = scene.transform_roots.pivot_of(root).unwrap_or_default();
+            far_domains::transform_point(&scene.domains[domain as usize].placement_matrix(), pivot)
+        };
+        let mut origins = Self::with_shared_origin(&scene.origin_grids, [0.0; 3], roots.map(translation).collect());
+        origins.update_shared_origin();
+        origins
+    }
+
     fn with_shared_origin(grids: &Arc<OriginGrids>, shared_origin: [f64; 3], translations: Vec<[f64; 3]>) -> Self {
         let mut origins = Self {
             grids: Arc::clone(grids),
@@ -155,6 +158,25 @@ impl FloatingOrigins {
         };
         origins.counts = origins.count_distances(shared_origin);
         origins
+    }
+
+    /// The points of the roots' frames that the transforms of a state map to their translations, in the order of the
+    /// translations. Empty if all are zero.
+    pub fn pivots(&self) -> &[[f64; 3]] {
+        &self.grids.pivots
+    }
+
+    /// Converts the translations of transforms to the pivots of a scene. `pivots` are those of the scene from which the
+    /// translations come; an empty list means zero.
+    pub fn change_pivots(scene: &Scene, transforms: &[Transform], pivots: &[[f64; 3]], translations: &mut [[f64; 3]]) {
+        for (root, (translation, transform)) in translations.iter_mut().zip(transforms).enumerate() {
+            let pivot = scene.transform_roots.pivot_of(root).unwrap_or_default();
+            let change = subtract(pivot, pivots.get(root).copied().unwrap_or_default());
+            if change != [0.0; 3] {
+                let change = transform.linear() * nalgebra::Vector3::from(change);
+                *translation = std::array::from_fn(|axis| translation[axis] + change[axis]);
+            }
+        }
     }
 
     /// Restores floating origins from the stored values of [`Self::shared_origin`] and [`Self::translations`]. The
@@ -201,7 +223,7 @@ impl FloatingOrigins {
     pub fn origin_of(&self, root: usize) -> [f64; 3] {
         let translation = self.translations[root];
         if self.grids.is_beyond(root, translation, self.shared_origin, SHARED_REACH) {
-            snap_to_grid(translation, self.grids.spacings[root])
+            translation.map(|coordinate| snap_to_grid(coordinate, self.grids.spacings[root]))
         } else {
             self.shared_origin
         }
@@ -315,11 +337,6 @@ impl FloatingOrigins {
         }
         (rebased, bounds)
     }
-}
-
-/// The multiple of `spacing` nearest to a point, per axis.
-fn snap_to_grid(point: [f64; 3], spacing: f64) -> [f64; 3] {
-    point.map(|coordinate| (coordinate / spacing).round() * spacing)
 }
 
 fn subtract(minuend: [f64; 3], subtrahend: [f64; 3]) -> [f64; 3] {

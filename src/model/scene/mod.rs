@@ -5,10 +5,13 @@
 
 mod camera;
 mod deformation;
+mod drawn_bounds;
+mod far_domains;
 mod features;
 mod floating_origin;
 mod frame_size;
 mod frame_style;
+mod framing;
 mod layout;
 mod light_space;
 mod look_preset;
@@ -26,10 +29,12 @@ mod transform_roots;
 
 pub use camera::{BoundingBox, Camera, Lens, View};
 pub use deformation::{DeformationSettings, NormalMethod, StorageType};
+pub use drawn_bounds::{DrawnBounds, FrameBounds};
 pub use features::SceneFeatures;
 pub use floating_origin::{FloatingOrigins, HOME_REACH, OriginGrids, SHARED_REACH};
 pub use frame_size::FrameSize;
 pub use frame_style::FrameStyle;
+pub use framing::{CameraSource, Framing};
 pub use layout::{DomainLayout, Layout};
 pub use light_space::{OrientedBounds, light_axes};
 pub use look_preset::{FrameAntialiasing, LookOverrides, LookPreset, PresetRequest, RendererKind};
@@ -117,10 +122,15 @@ pub struct Scene {
     pub transform_roots: TransformRoots,
     /// The optional features that the scene uses.
     pub features: SceneFeatures,
-    /// Bounds of the rest state in scene units.
+    /// Bounds of the drawn vertices at rest in scene units.
     pub rest_bounds: BoundingBox,
+    /// Bounds of the drawn vertices of each shape.
+    pub drawn_bounds: DrawnBounds,
     /// Spacings of the floating origins of the transform roots.
     pub origin_grids: Arc<OriginGrids>,
+    /// Whether a domain is so far from the scene's origin, or from the origin of its own frame, that the rest state
+    /// needs floating origins.
+    pub is_far: bool,
 }
 
 impl Scene {
@@ -162,7 +172,16 @@ impl Scene {
         for index in 0..parts.domains.len() {
             check_domain(&parts, index).map_err(|error| error.prefix_field(&format!("domain {index}")))?;
         }
-        let transform_roots = TransformRoots::new(&mut parts.domains)?;
+        let mut transform_roots = TransformRoots::new(&parts.shapes, &mut parts.domains)?;
+        let had_origins = parts.shapes.iter().any(Shape::is_centered);
+        let far_remark = far_domains::separate_far_domains(&mut parts)?;
+        let is_far = far_remark.is_some();
+        if is_far || had_origins {
+            // The frames of followers depend on the origins of shapes.
+            transform_roots = TransformRoots::new(&parts.shapes, &mut parts.domains)?;
+        }
+        // Parts of a scene already have its remark.
+        parts.remarks.extend(far_remark.filter(|remark| !parts.remarks.contains(remark)));
         parts.look.check()?;
         drop_textures_without_uvs(&mut parts);
         parts.remarks.extend(negative_eigenvalues(&parts.domains));
@@ -174,6 +193,7 @@ impl Scene {
         if features.exact_normals {
             add_smoothing(&mut parts)?;
         }
+        let drawn_bounds = DrawnBounds::new(&parts.shapes);
         let mut scene = Self {
             name: parts.name,
             shapes: parts.shapes,
@@ -191,7 +211,9 @@ impl Scene {
             transform_roots,
             features,
             rest_bounds: BoundingBox::EMPTY,
+            drawn_bounds,
             origin_grids,
+            is_far,
         };
         scene.rest_bounds = scene.compute_rest_bounds();
         Ok(Arc::new(scene))
@@ -220,10 +242,10 @@ impl Scene {
     fn compute_rest_bounds(&self) -> BoundingBox {
         let mut bounds = BoundingBox::EMPTY;
         for domain in &self.domains {
-            let world_from_domain = domain.placement.to_matrix();
-            for position in self.shapes[domain.shape].mesh.rest_positions() {
-                let world_position = world_from_domain.transform_point(&nalgebra::Point3::from(*position).cast());
-                bounds.include(world_position.coords.into());
+            let (world_from_domain, shape) = (domain.placement_matrix(), &self.shapes[domain.shape]);
+            for position in shape.mesh.drawn_positions() {
+                let x0 = std::array::from_fn(|axis| f64::from(position[axis]) + shape.origin()[axis]);
+                bounds.include(far_domains::transform_point(&world_from_domain, x0));
             }
         }
         bounds
@@ -272,6 +294,11 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     }
     let rank = parts.shapes[domain.shape].modes.rank();
     crate::domain::Transform::new(domain.placement.0).map_err(|error| error.prefix_field("placement"))?;
+    let origin = parts.shapes[domain.shape].origin();
+    let mut exact_numbers = domain.placement_remainder.iter().chain(&origin);
+    if let Some(number) = exact_numbers.find(|number| !number.is_finite()) {
+        return Err(invalid("placement", "finite numbers", number));
+    }
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
         return Err(invalid("rest_q", format!("none or {rank} coordinates"), domain.rest_q.len()));
     }

@@ -31,10 +31,12 @@ pub struct SceneState {
     /// All coordinates, packed as in [`super::Layout`].
     pub q: Vec<f32>,
     /// `world_from_domain` of each transform root ([`super::TransformRoots`]), relative to its floating origin
-    /// ([`Self::origin_of`]). Before the first step with f64 translations, every floating origin is the scene's origin;
-    /// [`FloatingOrigins`] chooses the later ones.
+    /// ([`Self::origin_of`]). It acts on rest positions relative to the root's pivot
+    /// ([`super::TransformRoots::pivot_of`]). Unless the scene is far ([`Scene::is_far`]), every floating origin is the
+    /// scene's origin before the first step with f64 translations; [`FloatingOrigins`] chooses the others.
     pub transforms: Vec<Transform>,
-    /// The f64 translations and floating origins. Present after the first step with f64 translations.
+    /// The f64 translations and floating origins. Present after the first step with f64 translations, and always if the
+    /// scene is far.
     pub origins: Option<Arc<FloatingOrigins>>,
     /// Number of updates of this state; 0 at rest. If a deformer computed the state with serial s and receives the
     /// state with serial s + 1, it may compute only the domains in `dirty_domains`. It must compute all domains for any
@@ -61,9 +63,15 @@ impl SceneState {
         for (domain, layout) in scene.domains.iter().zip(&scene.layout.domains) {
             q[layout.first_q..][..domain.rest_q.len()].copy_from_slice(&domain.rest_q);
         }
-        let transforms =
+        let mut transforms: Vec<Transform> =
             scene.transform_roots.domains().map(|domain| scene.domains[domain as usize].placement).collect();
-        Self { run: 0, step: 0, time: 0.0, q, transforms, origins: None, serial: 0, dirty_domains: DirtyDomains::All }
+        let origins = scene.is_far.then(|| Arc::new(FloatingOrigins::at_rest(scene)));
+        if let Some(origins) = &origins {
+            for (root, transform) in transforms.iter_mut().enumerate() {
+                *transform = origins.rebase_transform(root, *transform);
+            }
+        }
+        Self { run: 0, step: 0, time: 0.0, q, transforms, origins, serial: 0, dirty_domains: DirtyDomains::All }
     }
 
     /// Applies a step. Domains that the step does not contain keep their values. The cost is proportional to the number

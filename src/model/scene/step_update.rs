@@ -53,10 +53,11 @@ pub struct StepUpdate {
     spans: Vec<CoordinateSpan>,
     /// The coordinates of all spans, concatenated.
     values: Vec<f32>,
-    /// The transforms of the step, relative to the scene's origin and rounded to f32.
+    /// The transforms of the step, relative to the scene's origin and rounded to f32. They act on rest positions
+    /// relative to the pivot of the root ([`super::TransformRoots::pivot_of`]).
     pub transforms: Vec<(u32, Transform)>,
     /// The unrounded translations, relative to the scene's origin, of those domains of `transforms` that were given in
-    /// f64. They have the order of `transforms`.
+    /// f64 or have a pivot. They have the order of `transforms`.
     translations: Vec<(u32, [f64; 3])>,
 }
 
@@ -82,7 +83,7 @@ impl StepUpdate {
         Ok(Self { number: raw.number, time: raw.time, spans, values, transforms, translations })
     }
 
-    /// Whether any translation was given in f64.
+    /// Whether any translation is in f64.
     pub const fn has_f64_translations(&self) -> bool {
         !self.translations.is_empty()
     }
@@ -198,17 +199,20 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
         return Err(invalid("step.transforms", expected, format!("{} bytes", raw.transforms.len())));
     }
     let origin = scene.origin.map(|meters| meters / scene.unit);
-    let parse = |bytes: &[u8]| match raw.transform_format {
-        TransformFormat::Affine => parse_affine(scene, bytes),
-        TransformFormat::QuaternionXyzwF32 => transform_format::parse_quaternion_f32(bytes),
-        TransformFormat::QuaternionXyzwF64 => transform_format::parse_quaternion_f64(bytes, origin),
+    let parse = |domain: u32, bytes: &[u8]| {
+        let pivot = scene.transform_roots.pivot_of(scene.transform_roots.root_of(domain as usize));
+        match raw.transform_format {
+            TransformFormat::Affine => parse_affine(scene, bytes, pivot),
+            TransformFormat::QuaternionXyzwF32 => transform_format::parse_quaternion_f32(bytes, pivot),
+            TransformFormat::QuaternionXyzwF64 => transform_format::parse_quaternion_f64(bytes, origin, pivot),
+        }
     };
     if domains.len() >= PARALLEL_TRANSFORMS {
-        return parse_transforms_in_parallel(raw, &domains, parse);
+        return parse_transforms_in_parallel(raw, &domains, !scene.transform_roots.pivots().is_empty(), parse);
     }
     let (mut transforms, mut translations) = (Vec::with_capacity(domains.len()), Vec::new());
     for (index, (domain, bytes)) in domains.into_iter().zip(raw.transforms.chunks_exact(transform_bytes)).enumerate() {
-        let (transform, translation) = parse(bytes).map_err(|error| in_transform(index, error))?;
+        let (transform, translation) = parse(domain, bytes).map_err(|error| in_transform(index, error))?;
         transforms.push((domain, transform));
         translations.extend(translation.map(|translation| (domain, translation)));
     }
@@ -219,12 +223,13 @@ fn parse_transforms(scene: &Scene, raw: &RawStepUpdate) -> Result<ParsedTransfor
 fn parse_transforms_in_parallel(
     raw: &RawStepUpdate,
     domains: &[u32],
-    parse: impl Fn(&[u8]) -> Result<ParsedTransform> + Sync,
+    has_pivots: bool,
+    parse: impl Fn(u32, &[u8]) -> Result<ParsedTransform> + Sync,
 ) -> Result<ParsedTransforms> {
     let transform_bytes = raw.transform_format.bytes();
     let first_invalid = AtomicUsize::new(usize::MAX);
     let parse_or_note = |(index, (bytes, domain)): (usize, (&[u8], &u32))| {
-        let (transform, translation) = parse(bytes).unwrap_or_else(|_| {
+        let (transform, translation) = parse(*domain, bytes).unwrap_or_else(|_| {
             first_invalid.fetch_min(index, Ordering::Relaxed);
             (Transform::IDENTITY, None)
         });
@@ -233,16 +238,19 @@ fn parse_transforms_in_parallel(
     let encoded_transforms = raw.transforms.par_chunks_exact(transform_bytes);
     let parsed = encoded_transforms.zip(domains).enumerate().map(parse_or_note);
     let (transforms, translations) = match raw.transform_format {
-        TransformFormat::QuaternionXyzwF64 => {
+        TransformFormat::Affine | TransformFormat::QuaternionXyzwF32 if !has_pivots => {
+            (parsed.map(|(transform, _)| transform).collect(), vec![])
+        }
+        _ => {
             let (transforms, translations): (Vec<_>, Vec<_>) = parsed.unzip();
             (transforms, translations.into_iter().flatten().collect())
         }
-        _ => (parsed.map(|(transform, _)| transform).collect(), vec![]),
     };
     // Parsing the first invalid transform again gives its error.
     let first_invalid = first_invalid.into_inner();
-    if let Some(bytes) = raw.transforms.chunks_exact(transform_bytes).nth(first_invalid) {
-        parse(bytes).map_err(|error| in_transform(first_invalid, error))?;
+    let mut encoded_transforms = raw.transforms.chunks_exact(transform_bytes).zip(domains);
+    if let Some((bytes, domain)) = encoded_transforms.nth(first_invalid) {
+        parse(*domain, bytes).map_err(|error| in_transform(first_invalid, error))?;
     }
     Ok((transforms, translations))
 }
@@ -254,8 +262,8 @@ fn in_transform(index: usize, error: Error) -> Error {
 
 /// Parses [`TransformFormat::Affine`], the only format that can contain shear or a non-uniform scale, and rejects both
 /// in scenes without the feature `shear`.
-fn parse_affine(scene: &Scene, bytes: &[u8]) -> Result<ParsedTransform> {
-    let (transform, translation) = transform_format::parse_affine(bytes)?;
+fn parse_affine(scene: &Scene, bytes: &[u8], pivot: Option<[f64; 3]>) -> Result<ParsedTransform> {
+    let (transform, translation) = transform_format::parse_affine(bytes, pivot)?;
     if !scene.features.shear && !transform.is_similarity() {
         let expected = "no shear and a uniform scale (the scene declares rigid transforms)";
         return Err(invalid("linear", expected, format!("{:?}", transform.0)));

@@ -36,26 +36,40 @@ impl TransformFormat {
     }
 }
 
-/// A parsed transform relative to the scene's origin and, if its translation was given in f64, the unrounded
-/// translation.
+/// A parsed transform relative to the scene's origin and, if its translation was given in f64 or the domain has a
+/// pivot, the unrounded translation.
 pub(super) type ParsedTransform = (Transform, Option<[f64; 3]>);
 
-/// Parses [`TransformFormat::Affine`].
-pub(super) fn parse_affine(bytes: &[u8]) -> Result<ParsedTransform> {
-    Ok((Transform::new(decode_f32_array(bytes))?, None))
+/// Parses [`TransformFormat::Affine`]. `pivot` is p in [`move_to_pivot`].
+pub(super) fn parse_affine(bytes: &[u8], pivot: Option<[f64; 3]>) -> Result<ParsedTransform> {
+    let transform = Transform::new(decode_f32_array(bytes))?;
+    Ok(match pivot {
+        None => (transform, None),
+        Some(pivot) => move_to_pivot(&transform.linear(), transform.translation(), pivot),
+    })
+}
+
+/// T = (A, t) as a transform of positions relative to the pivot p: (A, A p + t), with the translation in f64.
+fn move_to_pivot(linear: &Matrix3<f64>, translation: Vector3<f64>, pivot: [f64; 3]) -> ParsedTransform {
+    let moved = linear * Vector3::from(pivot) + translation;
+    (Transform::from_parts(linear, &moved), Some(moved.into()))
 }
 
 /// Parses [`TransformFormat::QuaternionXyzwF32`].
-pub(super) fn parse_quaternion_f32(bytes: &[u8]) -> Result<ParsedTransform> {
+pub(super) fn parse_quaternion_f32(bytes: &[u8], pivot: Option<[f64; 3]>) -> Result<ParsedTransform> {
     let (rotation, translation) = bytes.split_at(16);
     let translation: [f32; 3] = decode_f32_array(translation);
     check_finite("translation", &translation.map(f64::from))?;
     let linear = rotation_matrix(decode_f32_array(rotation))?;
-    Ok((Transform::from_parts(&linear, &Vector3::from(translation).cast()), None))
+    let translation = Vector3::from(translation).cast();
+    Ok(match pivot {
+        None => (Transform::from_parts(&linear, &translation), None),
+        Some(pivot) => move_to_pivot(&linear, translation, pivot),
+    })
 }
 
 /// Parses [`TransformFormat::QuaternionXyzwF64`]. `origin` is the scene's origin in scene units.
-pub(super) fn parse_quaternion_f64(bytes: &[u8], origin: [f64; 3]) -> Result<ParsedTransform> {
+pub(super) fn parse_quaternion_f64(bytes: &[u8], origin: [f64; 3], pivot: Option<[f64; 3]>) -> Result<ParsedTransform> {
     let (rotation, translation) = bytes.split_at(16);
     let absolute: [f64; 3] = decode_array(translation, f64::from_le_bytes);
     check_finite("translation", &absolute)?;
@@ -67,7 +81,10 @@ pub(super) fn parse_quaternion_f64(bytes: &[u8], origin: [f64; 3]) -> Result<Par
         }
     }
     let linear = rotation_matrix(decode_f32_array(rotation))?;
-    Ok((Transform::from_parts(&linear, &Vector3::from(relative)), Some(relative)))
+    Ok(match pivot {
+        None => (Transform::from_parts(&linear, &Vector3::from(relative)), Some(relative)),
+        Some(pivot) => move_to_pivot(&linear, relative.into(), pivot),
+    })
 }
 
 /// The matrix of a quaternion that is normalized in f64.
@@ -137,9 +154,9 @@ mod tests {
             .map(|number| number as f32);
         let f32_bytes = pack(rotation, [1.5_f32, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
         let f64_bytes = pack(rotation, [1.5_f64, -2.0, 0.25].map(|number| number.to_le_bytes().to_vec()));
-        let (f32_transform, no_translation) = parse_quaternion_f32(&f32_bytes[1..]).expect("a valid transform");
+        let (f32_transform, no_translation) = parse_quaternion_f32(&f32_bytes[1..], None).expect("a valid transform");
         let (f64_transform, f64_translation) =
-            parse_quaternion_f64(&f64_bytes[1..], [0.0; 3]).expect("a valid transform");
+            parse_quaternion_f64(&f64_bytes[1..], [0.0; 3], None).expect("a valid transform");
         assert_eq!((f32_transform, no_translation, f64_translation), (f64_transform, None, Some([1.5, -2.0, 0.25])));
         let error = (f32_transform.linear() - expected_rotation.to_rotation_matrix().into_inner()).abs().max();
         assert!(error <= 2e-7, "{error}");
@@ -151,7 +168,7 @@ mod tests {
 
     #[test]
     fn quaternion_is_normalized_within_the_tolerance() {
-        let parse_with_w = |w: f32| parse_quaternion_f32(&pack([0.0, 0.0, 0.0, w], [vec![0; 12]])[1..]);
+        let parse_with_w = |w: f32| parse_quaternion_f32(&pack([0.0, 0.0, 0.0, w], [vec![0; 12]])[1..], None);
         assert_eq!(parse_with_w(1.0009).expect("a norm within the tolerance").0, Transform::IDENTITY);
         // A quaternion and its negative are the same rotation.
         assert_eq!(parse_with_w(-0.9991).expect("a norm within the tolerance").0, Transform::IDENTITY);
@@ -170,7 +187,7 @@ mod tests {
         let position = [1e7 + 0.001, -1e7, 12.5];
         let bytes = pack([0.0, 0.0, 0.0, 1.0], position.map(|number: f64| number.to_le_bytes().to_vec()));
         let (transform, f64_translation) =
-            parse_quaternion_f64(&bytes[1..], [1e7, -1e7, 0.0]).expect("a valid transform");
+            parse_quaternion_f64(&bytes[1..], [1e7, -1e7, 0.0], None).expect("a valid transform");
         assert!((transform.0[3] - 0.001).abs() < 2e-9, "{}", transform.0[3]);
         assert_eq!(
             (transform.0[7], transform.0[11], f64_translation.map(|translation| translation[2])),
@@ -184,7 +201,7 @@ mod tests {
     fn distant_and_non_finite_translations_are_rejected() {
         let parse_at = |x: f64, origin: f64| {
             let translation = [x, 0.0, 0.0].map(|number| number.to_le_bytes().to_vec());
-            parse_quaternion_f64(&pack([0.0, 0.0, 0.0, 1.0], translation)[1..], [origin, 0.0, 0.0]).map(drop)
+            parse_quaternion_f64(&pack([0.0, 0.0, 0.0, 1.0], translation)[1..], [origin, 0.0, 0.0], None).map(drop)
         };
         // MAX_TRANSLATION is about 1.1e12. It also limits the difference from the scene's origin.
         assert_eq!(parse_at(MAX_TRANSLATION, 0.0), Ok(()));

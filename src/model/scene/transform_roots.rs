@@ -1,9 +1,9 @@
 //! Transform roots and followers. A root is a domain with a transform of its own, which steps can set. A follower moves
 //! with its root: a constant transform, its frame, maps coordinates of the follower to the root.
 
-use nalgebra::Matrix4;
+use nalgebra::{Matrix4, Vector3};
 
-use crate::domain::{ComposedTransform, Domain, Transform};
+use crate::domain::{ComposedTransform, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
 
 /// The transform roots of a scene, and the root and frame of every follower. [`super::SceneState::transforms`] has one
@@ -11,6 +11,8 @@ use crate::error::{Result, invalid};
 #[derive(Debug, Clone, PartialEq)]
 pub struct TransformRoots {
     count: usize,
+    /// Per root, the origin of the rest positions of its shape ([`Shape::origin`]). Empty if all are zero.
+    pivots: Vec<[f64; 3]>,
     /// `None` if the scene has no followers; every domain is then its own root.
     table: Option<FollowTable>,
 }
@@ -38,11 +40,15 @@ impl TransformRoots {
     /// the follower's frame. The caller has checked that every parent precedes its children. Products of frames are
     /// computed in f64 and rounded once.
     ///
+    /// Let p be the pivot of a root, and c the origin of the shape of its follower. The frame of the follower that
+    /// deformers use maps v = x0 - c to F x0 - p, because their transform of the root acts on x0 - p.
+    ///
     /// # Errors
     /// `Invalid` with the domain whose frame or placement exceeds the range of f32.
-    pub(super) fn new(domains: &mut [Domain]) -> Result<Self> {
+    pub(super) fn new(shapes: &[Shape], domains: &mut [Domain]) -> Result<Self> {
         if domains.iter().all(|domain| domain.follows.is_none()) {
-            return Ok(Self { count: domains.len(), table: None });
+            let pivots = non_zero(domains.iter().map(|domain| shapes[domain.shape].origin()).collect());
+            return Ok(Self { count: domains.len(), pivots, table: None });
         }
         let mut table = FollowTable::default();
         // Unrounded frames, for followers of followers.
@@ -59,19 +65,36 @@ impl TransformRoots {
             let frame = frames_f64
                 .get(parent_frame_index as usize)
                 .map_or(parent_from_domain, |parent_frame| parent_frame * parent_from_domain);
-            let rounded_frame = Transform::from_matrix(&frame);
-            let root_placement = domains[table.domains[root as usize] as usize].placement;
-            let placement = ComposedTransform { root: root_placement, frame: Some(rounded_frame) }.to_f32();
+            let root_domain = &domains[table.domains[root as usize] as usize];
+            let (pivot, origin) = (shapes[root_domain.shape].origin(), shapes[domains[index].shape].origin());
+            let rounded_frame = centered_frame(&frame, pivot, origin);
+            let exact_placement = root_domain.placement_matrix() * frame;
+            let uncentered_frame = Some(Transform::from_matrix(&frame));
+            let placement = ComposedTransform { root: root_domain.placement, frame: uncentered_frame }.to_f32();
             for (field, transform) in [("follows.frame", rounded_frame), ("placement", placement)] {
                 Transform::new(transform.0).map_err(|error| error.prefix_field(&format!("domain {index}: {field}")))?;
             }
-            domains[index].placement = placement;
+            domains[index].set_rounded_placement(placement, &exact_placement);
             table.root_and_frame_indices.push([root, frames_f64.len() as u32]);
             table.frames.push(rounded_frame);
             frames_f64.push(frame);
         }
         table.list_followers();
-        Ok(Self { count: table.domains.len(), table: Some(table) })
+        let pivot = |root: &u32| shapes[domains[*root as usize].shape].origin();
+        let pivots = non_zero(table.domains.iter().map(pivot).collect());
+        Ok(Self { count: table.domains.len(), pivots, table: Some(table) })
+    }
+
+    /// The pivot of each root ([`Self::pivot_of`]). Empty if all are zero.
+    pub fn pivots(&self) -> &[[f64; 3]] {
+        &self.pivots
+    }
+
+    /// p, the point of a root's frame that the root's transform in a state maps to its translation: the origin of the
+    /// rest positions of its shape. With T = (A, t) as steps contain it, the state has (A, A p + t). `None` if p is
+    /// zero.
+    pub fn pivot_of(&self, root: usize) -> Option<[f64; 3]> {
+        self.pivots.get(root).copied().filter(|pivot| *pivot != [0.0; 3])
     }
 
     /// The number of transform roots, which is the length of [`super::SceneState::transforms`].
@@ -119,6 +142,20 @@ impl TransformRoots {
     pub fn follower_frames(&self) -> &[Transform] {
         self.table.as_ref().map_or(&[], |table| &table.frames)
     }
+}
+
+/// The list, or an empty list if all points are zero.
+fn non_zero(points: Vec<[f64; 3]>) -> Vec<[f64; 3]> {
+    if points.iter().all(|point| *point == [0.0; 3]) { Vec::new() } else { points }
+}
+
+/// The frame of a follower for rest positions relative to `origin`, and for a root with a pivot.
+fn centered_frame(frame: &Matrix4<f64>, pivot: [f64; 3], origin: [f64; 3]) -> Transform {
+    if pivot == [0.0; 3] && origin == [0.0; 3] {
+        return Transform::from_matrix(frame);
+    }
+    let to_pivot = Matrix4::new_translation(&-Vector3::from(pivot));
+    Transform::from_matrix(&(to_pivot * frame * Matrix4::new_translation(&origin.into())))
 }
 
 impl FollowTable {

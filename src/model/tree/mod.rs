@@ -173,18 +173,8 @@ impl PartPlacer<'_> {
     }
 
     fn create_domain(&self, name: String, template_index: usize, material: usize, placement: Transform) -> Domain {
-        Domain {
-            name,
-            shape: template_index,
-            material,
-            placement,
-            attachment: None,
-            follows: None,
-            material_ranges: vec![],
-            rest_q: vec![],
-            shares_q_with: None,
-            metadata: self.metadata[template_index].clone(),
-        }
+        let metadata = self.metadata[template_index].clone();
+        Domain { material, placement, metadata, ..Domain::new(name, template_index) }
     }
 }
 

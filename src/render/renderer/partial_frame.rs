@@ -133,6 +133,11 @@ impl PartialFrame {
         self.upload_ms = Some(ms);
     }
 
+    /// Sets whether the camera frames the present state ([`FrameInfo::is_reframed`]).
+    pub const fn set_reframed(&mut self, is_reframed: bool) {
+        self.info.is_reframed = is_reframed;
+    }
+
     /// How the frame is drawn, without the rasterizers, which are known when it is finished.
     pub const fn info(&self) -> &FrameInfo {
         &self.info
@@ -436,6 +441,7 @@ fn frame_info(buffers: &SceneBuffers, params: &FrameParams, antialiasing: FrameA
         shares_samples: false,
         look: Some(FrameLook { preset, antialias, samples, shadow: buffers.look.shadow }),
         below_ground: depth_below_ground(&buffers.scene, params, buffers.origin),
+        is_reframed: false,
     }
 }
 

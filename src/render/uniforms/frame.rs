@@ -208,8 +208,8 @@ pub(crate) fn depth_below_ground(scene: &Scene, params: &FrameParams, origin: [f
     if is_below { depth * scene.unit } else { 0.0 }
 }
 
-/// Distance of the origin from the scene's origin, in diagonals of the rest bounds, from which the ground is centered
-/// at the current bounds. It is large, because the fade of the ground changes there.
+/// Distance of the origin from the scene at rest, in diagonals of the rest bounds, from which the ground is centered at
+/// the current bounds. It is large, because the fade of the ground changes there.
 const GROUND_FOLLOW_DISTANCE: f64 = 4096.0;
 
 /// Rest bounds relative to `origin`. If the scene moved far away ([`GROUND_FOLLOW_DISTANCE`]), the rest bounds are
@@ -218,7 +218,7 @@ const GROUND_FOLLOW_DISTANCE: f64 = 4096.0;
 fn rebased_rest_bounds(scene: &Scene, bounds: BoundingBox, origin: [f64; 3]) -> BoundingBox {
     let rest_bounds = scene.rest_bounds;
     let mut shift = -Vector3::from(origin);
-    if shift.amax() > GROUND_FOLLOW_DISTANCE * rest_bounds.diagonal() {
+    if (rest_bounds.center().coords + shift).amax() > GROUND_FOLLOW_DISTANCE * rest_bounds.diagonal() {
         shift = bounds.center() - rest_bounds.center();
         shift[scene.up.index()] = -origin[scene.up.index()];
     }

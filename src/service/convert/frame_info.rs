@@ -12,6 +12,7 @@ pub(crate) fn wire_frame_info(info: &FrameInfo) -> v1::FrameHead {
         visibility_drawn_by: wire_raster_backend(info.raster_backends.visibility).into(),
         look: info.look.as_ref().map(wire_look),
         below_ground: info.below_ground,
+        reframed: info.is_reframed,
         ..v1::FrameHead::default()
     }
 }

@@ -32,6 +32,7 @@ pub fn export_gltf(recording: &Recording, slow: f64, out: &Path) -> Result<()> {
         ShapeArray::Indices,
         ShapeArray::CornerVertices,
         ShapeArray::RestPositions,
+        ShapeArray::CenteredPositions,
         ShapeArray::Uvs,
         ShapeArray::RestNormals,
         ShapeArray::Modes,
@@ -49,11 +50,13 @@ pub fn export_gltf(recording: &Recording, slow: f64, out: &Path) -> Result<()> {
     let selected = StateTimes::read_increasing(recording, slow)?;
     let times: Vec<f32> = selected.times.iter().map(|time| *time as f32).collect();
     let input = glb.add_floats(Element::Scalar, &times)?;
-    let mut animation = Animation { input, samplers: Vec::new(), channels: Vec::new() };
+    let offset = scene_offset(&description);
+    let mut animation = Animation { input, offset, samplers: Vec::new(), channels: Vec::new() };
     let mut nodes = Vec::new();
     for_each_track(recording, &selected, |index, track| {
         let domain = &description.domains[index];
-        nodes.push(animation.add_domain(&mut glb, domain, mesh_indices[index], &track, &selected)?);
+        let place = DomainPlace { mesh: mesh_indices[index], origin: description.shapes[domain.shape].origin };
+        nodes.push(animation.add_domain(&mut glb, domain, place, &track, &selected)?);
         Ok(())
     })?;
 
@@ -66,7 +69,7 @@ pub fn export_gltf(recording: &Recording, slow: f64, out: &Path) -> Result<()> {
     };
     let textures: Vec<Value> = (0..images.len()).map(|source| json!({ "source": source })).collect();
     let children: Vec<usize> = (0..nodes.len()).collect();
-    nodes.push(root_node(&description, children));
+    nodes.push(root_node(&description, offset, children));
     insert("asset", json!({ "version": "2.0", "generator": concat!("modalcast-record ", env!("CARGO_PKG_VERSION")) }));
     insert("scene", json!(0));
     insert("scenes", json!([{ "nodes": [nodes.len() - 1] }]));
@@ -81,8 +84,30 @@ pub fn export_gltf(recording: &Recording, slow: f64, out: &Path) -> Result<()> {
     glb.finish(document)
 }
 
-/// The node of the scene: scales to meters and turns the up axis to y.
-fn root_node(description: &SceneDescription, children: Vec<usize>) -> Value {
+/// The point that the translations of the nodes are relative to, in scene units: zero, or the place of the first domain
+/// in a scene that is far from its origin. Programs that read glTF compute in f32.
+fn scene_offset(description: &SceneDescription) -> [f64; 3] {
+    let shape_of = |domain: &Domain| &description.shapes[domain.shape];
+    let is_far =
+        |domain: &Domain| shape_of(domain).has_origin() || domain.exact_placement != domain.placement.map(f64::from);
+    match description.domains.first() {
+        Some(first) if description.domains.iter().any(is_far) => {
+            apply(&first.exact_placement, shape_of(first).origin).map(f64::round)
+        }
+        _ => [0.0; 3],
+    }
+}
+
+/// A transform of a point.
+fn apply(matrix: &Matrix3x4, point: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|row| {
+        let entries = &matrix[4 * row..][..4];
+        entries[0] * point[0] + entries[1] * point[1] + entries[2] * point[2] + entries[3]
+    })
+}
+
+/// The node of the scene: scales to meters, turns the up axis to y, and moves by the offset of the other nodes.
+fn root_node(description: &SceneDescription, offset: [f64; 3], children: Vec<usize>) -> Value {
     let info = &description.info;
     // The sine and the cosine of 45 degrees, half of a quarter turn.
     let sine = std::f64::consts::FRAC_1_SQRT_2;
@@ -92,7 +117,12 @@ fn root_node(description: &SceneDescription, children: Vec<usize>) -> Value {
         _ => [0.0, 0.0, 0.0, 1.0],
     };
     let scale = [info.unit; 3];
-    json!({ "name": info.scene, "children": children, "rotation": rotation, "scale": scale })
+    let mut node = json!({ "name": info.scene, "children": children, "rotation": rotation, "scale": scale });
+    if offset != [0.0; 3] {
+        let turned = DQuat::from_array(rotation) * (DVec3::from_array(offset) * info.unit);
+        node["translation"] = json!(turned.to_array());
+    }
+    node
 }
 
 fn material(material: &Material) -> Value {
@@ -198,7 +228,7 @@ fn add_shape(glb: &mut GlbBuilder<'_>, shape: &Shape) -> Result<ShapeAccessors> 
     let of_corners = |vector: &dyn Fn(usize) -> [f32; 3]| -> Vec<f32> {
         shape.corner_vertices.iter().flat_map(|vertex| vector(*vertex as usize)).collect()
     };
-    let position = |vertex: usize| std::array::from_fn(|axis| shape.rest_positions[3 * vertex + axis]);
+    let position = |vertex: usize| std::array::from_fn(|axis| shape.local_positions()[3 * vertex + axis]);
     let mut attributes = json!({
         "POSITION": glb.add_floats(Element::Vec3, &of_corners(&position))?,
         "NORMAL": glb.add_floats(Element::Vec3, &shape.rest_normals)?,
@@ -251,9 +281,18 @@ impl NodeTransform {
     }
 }
 
+/// The mesh of a domain, and the point of the domain's frame that the positions of the mesh are relative to.
+#[derive(Debug, Clone, Copy)]
+struct DomainPlace {
+    mesh: usize,
+    origin: [f64; 3],
+}
+
 struct Animation {
     /// The accessor of the times.
     input: usize,
+    /// The point that translations are relative to.
+    offset: [f64; 3],
     samplers: Vec<Value>,
     channels: Vec<Value>,
 }
@@ -264,13 +303,15 @@ impl Animation {
         &mut self,
         glb: &mut GlbBuilder<'_>,
         domain: &Domain,
-        mesh: usize,
+        DomainPlace { mesh, origin }: DomainPlace,
         track: &Track,
         selected: &StateTimes,
     ) -> Result<Value> {
         let mut transforms: Vec<NodeTransform> = Vec::with_capacity(track.transforms.len());
         for (matrix, step) in track.transforms.iter().zip(&selected.steps) {
-            let transform = NodeTransform::decompose(matrix, transforms.last());
+            let (mut matrix, translation) = (*matrix, apply(matrix, origin));
+            (0..3).for_each(|axis| matrix[4 * axis + 3] = translation[axis] - self.offset[axis]);
+            let transform = NodeTransform::decompose(&matrix, transforms.last());
             transforms.push(transform.ok_or_else(|| {
                 let field = format!("step {step}: transform of domain '{}'", domain.name);
                 Error::invalid(

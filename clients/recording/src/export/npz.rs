@@ -24,13 +24,20 @@ use crate::reader::Recording;
 /// | `shape_k/x0`, `shape_k/faces`, `shape_k/U` | n x 3, m x 3, 3n x r | rest positions, triangles of vertices, modes |
 /// | `NAME/q`, `NAME/T` | steps x r, steps x 3 x 4 | coordinates (f32), and transforms (f64) in scene units relative to the scene's origin |
 ///
-/// A vertex is at x = T (x0 + U q). The second one of two domains with the same name has the name `NAME#INDEX`.
+/// `x0` is f32, or f64 for a shape that is far from the origin of its frame. A vertex is at x = T (x0 + U q). The
+/// second one of two domains with the same name has the name `NAME#INDEX`.
 ///
 /// # Errors
 /// `Unavailable` if the recording has only the hashes of its contents; `InvalidFile` if it is damaged; `File` if the
 /// file cannot be written.
 pub fn export_npz(recording: &Recording, out: &Path) -> Result<()> {
-    let arrays = [ShapeArray::Indices, ShapeArray::CornerVertices, ShapeArray::RestPositions, ShapeArray::Modes];
+    let arrays = [
+        ShapeArray::Indices,
+        ShapeArray::CornerVertices,
+        ShapeArray::RestPositions,
+        ShapeArray::CenteredPositions,
+        ShapeArray::Modes,
+    ];
     let description = recording.read_description(&arrays, false)?;
     let selected = StateTimes::read(recording)?;
     let file = File::create(out).map_err(|error| Error::open(out, &error))?;
@@ -46,8 +53,14 @@ pub fn export_npz(recording: &Recording, out: &Path) -> Result<()> {
     for (index, shape) in description.shapes.iter().enumerate() {
         let faces: Vec<u32> = shape.indices.iter().map(|corner| shape.corner_vertices[*corner as usize]).collect();
         let name = |array: &str| format!("shape_{index}/{array}");
-        let positions = bytemuck::cast_slice(&shape.rest_positions);
-        archive.add(&name("x0"), "<f4", &[shape.vertex_count, 3], positions)?;
+        let size = [shape.vertex_count, 3];
+        if shape.has_origin() {
+            let positions = shape.local_positions().iter().zip(shape.origin.iter().cycle());
+            let exact_positions: Vec<f64> = positions.map(|(v, origin)| f64::from(*v) + origin).collect();
+            archive.add(&name("x0"), "<f8", &size, bytemuck::cast_slice(&exact_positions))?;
+        } else {
+            archive.add(&name("x0"), "<f4", &size, bytemuck::cast_slice(&shape.rest_positions))?;
+        }
         archive.add(&name("faces"), "<u4", &[shape.triangle_count, 3], bytemuck::cast_slice(&faces))?;
         let modes = bytemuck::cast_slice(&shape.modes);
         archive.add(&name("U"), "<f4", &[3 * shape.vertex_count, shape.rank], modes)?;

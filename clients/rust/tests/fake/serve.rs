@@ -508,6 +508,7 @@ fn encode_frame(output: &StepOutput, picture: &v1::Picture, index: u32) -> Vec<v
             shadow_size: 512,
         }),
         below_ground: 0.25,
+        reframed: false,
     });
     let chunk = |ByteChunk { offset, data, .. }| v1::FrameChunk { head: head.take(), offset, data, shared: None };
     split_bytes(bytes).into_iter().map(chunk).collect()

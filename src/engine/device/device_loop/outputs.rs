@@ -12,6 +12,7 @@ use crate::engine::device::partial_output::{Charge, PartialKind, PartialOutput};
 use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::telemetry::ms_since;
+use modalcast_model::scene::Framing;
 use modalcast_render::ScenePreparation;
 
 impl DeviceLoop {
@@ -70,9 +71,19 @@ impl DeviceLoop {
         let Command::Draw { id, picture, content, reply } = command else { return };
         let PictureSpec { camera, size, output, style } = picture;
         let Self { context, scenes, loss, .. } = self;
-        let kind = find_scene(scenes, id).and_then(|scene| match output {
-            FrameOutput::Color => context.begin_frame(scene, &camera, size, style).map(PartialKind::Frame),
-            output => context.begin_aov(scene, &camera, size, output).map(PartialKind::Aov),
+        let kind = find_scene(scenes, id).and_then(|scene| {
+            let Framing { camera, is_moved } = camera.resolve(scene.scene(), scene.current_state(), size);
+            match output {
+                FrameOutput::Color => context.begin_frame(scene, &camera, size, style).map(|mut frame| {
+                    frame.set_reframed(is_moved);
+                    PartialKind::Frame(frame)
+                }),
+                output => {
+                    let mut draw = context.begin_aov(scene, &camera, size, output)?;
+                    draw.is_reframed = is_moved;
+                    Ok(PartialKind::Aov(draw))
+                }
+            }
         });
         let kind = match loss.record_loss(kind) {
             Ok(kind) => kind,
@@ -138,8 +149,10 @@ impl DeviceLoop {
                 }
             }
             (PartialKind::Aov(draw), Some(reply)) => {
+                let is_reframed = draw.is_reframed;
                 let aov = find_scene(scenes, id).and_then(|scene| context.finish_aov(scene, draw));
-                let picture = aov.map(|(image, legend)| Arc::new(RenderedPicture::from_aov(image, legend)));
+                let picture =
+                    aov.map(|(image, legend)| Arc::new(RenderedPicture::from_aov(image, legend, is_reframed)));
                 answer(reply, self.loss.record_loss(picture));
                 self.record_output_cost(id, charge, charge.spent_ms + ms_since(begin));
             }

@@ -18,7 +18,7 @@ use crate::engine::storage::file_system::{DiskFileSystem, FileSystem};
 use crate::engine::storage::provenance::SceneProvenance;
 use crate::engine::testing;
 use crate::hang_guard::HANG_GUARD;
-use modalcast_model::scene::{BoundingBox, Camera, DirtyDomains, FrameSize, FrameStyle, RawStepUpdate};
+use modalcast_model::scene::{BoundingBox, CameraSource, DirtyDomains, FrameSize, FrameStyle, RawStepUpdate};
 use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes};
 
 /// Wait for a command that must not arrive.
@@ -68,7 +68,7 @@ impl TestScene {
     /// Subscribes to frames of one view.
     async fn subscribe(&self, delivery: Delivery) -> Subscription {
         let picture = PictureSpec {
-            camera: Camera::fit_to_scene(&testing::two_strips(), 16, 8),
+            camera: CameraSource::framing(&testing::two_strips(), FrameSize::new(16, 8)),
             size: FrameSize::new(16, 8),
             output: FrameOutput::Color,
             style: FrameStyle::default(),

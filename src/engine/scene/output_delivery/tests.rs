@@ -17,7 +17,7 @@ use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{OutputBody, SharedPicture, StepOutput};
 use crate::engine::testing;
 use crate::hang_guard::HANG_GUARD;
-use modalcast_model::scene::{Camera, FrameSize, FrameStyle, RawStepUpdate, SceneState, StepUpdate};
+use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, RawStepUpdate, SceneState, StepUpdate};
 use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes, MAX_FRAMES_IN_FLIGHT};
 
 const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
@@ -45,7 +45,7 @@ fn current_step(number: u64) -> CurrentStep {
 
 /// Subscribes to frames of this width in pixels.
 fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
-    let camera = Camera::fit_to_scene(&testing::two_strips(), width, 8);
+    let camera = CameraSource::framing(&testing::two_strips(), FrameSize::new(width, 8));
     let size = FrameSize::new(width, 8);
     let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
     Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())

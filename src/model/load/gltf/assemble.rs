@@ -119,10 +119,8 @@ impl GltfAssembler<'_> {
             None => None,
         };
         // The node of a skinned mesh does not move it.
-        let placement = match node.skin {
-            Some(_) => Transform::IDENTITY,
-            None => to_transform(&placed_node.world)?,
-        };
+        let placement = if node.skin.is_some() { Matrix4::identity() } else { placed_node.world };
+        to_transform(&placement)?;
         let parent_domain = parent_domain.filter(|_| node.skin.is_none());
         let attachment = parent_domain.map(|parent_domain| create_attachment(&parent_domain)).transpose()?;
         let first_domain = self.domains.len();
@@ -149,14 +147,15 @@ impl GltfAssembler<'_> {
             let rest_q = weights.filter(|_| rank > 0).cloned().unwrap_or_default();
             self.reader.buffers.charge_budget(4 * rest_q.len() as u64)?;
             let first_of_rank = *first_by_rank.entry(rank).or_insert(self.domains.len());
-            self.domains.push(Domain {
+            let mut domain = Domain {
                 material: loaded.material,
-                placement,
                 attachment: attachment.clone(),
                 rest_q,
                 shares_q_with: (rank > 0 && first_of_rank < self.domains.len()).then_some(first_of_rank),
                 ..Domain::new(format!("{name}.{primitive_index}"), loaded.shape)
-            });
+            };
+            domain.set_placement(&placement);
+            self.domains.push(domain);
         }
         Ok((self.domains.len() > first_domain).then_some(first_domain))
     }
@@ -180,13 +179,13 @@ impl GltfAssembler<'_> {
         };
         let loaded = match primitive::convert_primitive(self.reader, primitive, options, &mut self.remarks)? {
             None => None,
-            Some(ConvertedPrimitive { mesh, modes, colors, has_target_normals }) => {
+            Some(ConvertedPrimitive { mesh, origin, modes, colors, has_target_normals }) => {
                 self.has_target_normals |= has_target_normals && modes.rank() > 0;
                 let has_uvs = !mesh.corners().uvs.is_empty();
                 let converter = &mut self.material_converter;
                 let material = converter.material_index(primitive.material, has_uvs, &mut self.remarks)?;
                 let (mesh, material) = converter.with_vertex_colors(material, mesh, colors, &mut self.remarks)?;
-                self.shapes.push(Shape::new(mesh, modes)?);
+                self.shapes.push(Shape::new(mesh, modes)?.with_origin(origin));
                 Some(LoadedPrimitive { shape: self.shapes.len() - 1, material })
             }
         };

@@ -8,7 +8,7 @@ use super::accessor::{AccessorReader, AttributeFormat, ComponentTypes};
 use super::document::{Primitive, TextureTransform};
 use super::remarks::ImportRemarks;
 use super::skin::Pose;
-use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, split_at_creases};
+use crate::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, RestOrigin, split_at_creases};
 use crate::error::{Result, invalid};
 use crate::load::values::CorrectedValue;
 
@@ -33,6 +33,8 @@ pub(super) struct PrimitiveOptions<'a> {
 #[derive(Debug)]
 pub(super) struct ConvertedPrimitive {
     pub(super) mesh: Mesh,
+    /// The point that the positions of the mesh are relative to.
+    pub(super) origin: [f64; 3],
     pub(super) modes: Modes,
     /// Linear colors of the vertices with alpha, 0 to 1; empty if they have none.
     pub(super) colors: Vec<[f32; 4]>,
@@ -73,7 +75,7 @@ pub(super) fn convert_primitive(
         pose.move_positions(&mut rest_positions);
     }
     let modes = read_modes(reader, primitive, vertex_count, pose.as_ref(), remarks)?;
-    let mesh = read_mesh(reader, primitive, rest_positions, (options, pose.as_ref()), remarks)?;
+    let (mesh, origin) = read_mesh(reader, primitive, rest_positions, (options, pose.as_ref()), remarks)?;
     let colors = match primitive.attributes.get("COLOR_0") {
         None => Vec::new(),
         Some(accessor) => {
@@ -82,7 +84,7 @@ pub(super) fn convert_primitive(
         }
     };
     let has_target_normals = primitive.targets.iter().any(|target| target.contains_key("NORMAL"));
-    Ok(Some(ConvertedPrimitive { mesh, modes, colors, has_target_normals }))
+    Ok(Some(ConvertedPrimitive { mesh, origin, modes, colors, has_target_normals }))
 }
 
 /// The linear colors of the vertices with alpha.
@@ -107,25 +109,30 @@ fn read_colors(
     Ok(colors.map(|([red, green, blue], alpha)| [red, green, blue, alpha_in_range(alpha)]).collect())
 }
 
+/// Reads the mesh and the origin of its rest positions.
 fn read_mesh(
     reader: AccessorReader<'_>,
     primitive: &Primitive,
-    mut rest_positions: Vec<[f32; 3]>,
+    mut file_positions: Vec<[f32; 3]>,
     (options, pose): (PrimitiveOptions<'_>, Option<&Pose>),
     remarks: &mut ImportRemarks,
-) -> Result<Mesh> {
+) -> Result<(Mesh, [f64; 3])> {
     let PrimitiveOptions { uv_set, crease_angle, uv_transform, .. } = options;
     let indices = match primitive.indices {
         Some(accessor) => {
-            reader.decode_indices(accessor, rest_positions.len()).map_err(|error| error.prefix_field("indices"))?
+            reader.decode_indices(accessor, file_positions.len()).map_err(|error| error.prefix_field("indices"))?
         }
-        None => (0..rest_positions.len() as u32).collect(),
+        None => (0..file_positions.len() as u32).collect(),
     };
     // A strip has at most as many triangles as indices.
     let max_triangles = if primitive.mode == TRIANGLES { indices.len() / 3 } else { indices.len() };
-    reader.buffers.reserve_mesh(rest_positions.len(), max_triangles)?;
+    reader.buffers.reserve_mesh(file_positions.len(), max_triangles)?;
     let triangles = build_triangles(&indices, primitive.mode)?;
-    check_positions(&mut rest_positions, &triangles, remarks)?;
+    check_positions(&mut file_positions, &triangles, remarks)?;
+    let exact_positions: Vec<[f64; 3]> = file_positions.iter().map(|position| position.map(f64::from)).collect();
+    let drawn = triangles.as_flattened().iter().map(|vertex| *vertex as usize);
+    let RestOrigin { origin, positions: rest_positions } = RestOrigin::choose(&exact_positions, drawn);
+    drop(exact_positions);
     let format = AttributeFormat { components: ComponentTypes::Quantized, count: Some(rest_positions.len()) };
     let mut normals = match primitive.attributes.get("NORMAL") {
         Some(accessor) => {
@@ -151,13 +158,13 @@ fn read_mesh(
     let file_normals: Vec<Option<[f32; 3]>> =
         normals.iter().map(|normal| Some(*normal).filter(|normal| *normal != [0.0; 3])).collect();
     if !normals.is_empty() && file_normals.iter().all(Option::is_some) {
-        return Mesh::from_indexed(rest_positions, normals, uvs, triangles);
+        return Mesh::from_indexed(rest_positions, normals, uvs, triangles).map(|mesh| (mesh, origin));
     }
     let vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
     let creased = split_at_creases(&rest_positions, &vertices, &triangles, &file_normals, crease_angle);
     let uvs = creased.source_corners.iter().filter_map(|vertex| uvs.get(*vertex as usize).copied()).collect();
     let corners = Corners { vertices: creased.source_corners, normals: creased.normals, uvs };
-    Mesh::new(rest_positions, corners, creased.triangles)
+    Mesh::new(rest_positions, corners, creased.triangles).map(|mesh| (mesh, origin))
 }
 
 /// Checks that the positions of all triangles are finite, and replaces those of other vertices.

@@ -4,6 +4,8 @@
 use std::collections::{HashMap, HashSet};
 use std::path::PathBuf;
 
+use nalgebra::Matrix4;
+
 use super::patch::{MaterialPatch, TextureLookup};
 use super::{DomainEntry, Manifest, TransformKind};
 use crate::backend_settings::{BackendSettings, RasterPolicy};
@@ -223,28 +225,36 @@ impl ManifestAssembler<'_> {
     /// Places the domains, and attaches those without a parent to the entry's parent.
     fn place_domains(&self, entry: &DomainEntry, domains: &mut [Domain]) -> Result<()> {
         let domain_offset = self.parts.domains.len();
-        let to_transform = |placement: &Option<super::Placement>, key: &str| match placement {
-            Some(placement) => placement.to_transform().map_err(|error| error.prefix_field(key)),
-            None => Ok(Transform::IDENTITY),
+        let to_matrix = |placement: &Option<super::Placement>, key: &str| match placement {
+            Some(placement) => placement.to_matrix().map_err(|error| error.prefix_field(key)),
+            None => Ok(Matrix4::identity()),
         };
         let parent = self.find_parent(entry)?;
-        let world_from_entry = match parent {
+        // f32 products as well as f64 ones, because the placement of a domain near the scene's origin is an f32
+        // product.
+        let (world_from_entry, exact_world_from_entry) = match parent {
             Some(parent) if entry.frame.is_some() => {
-                self.parts.domains[parent].placement.compose(to_transform(&entry.frame, "frame")?)
+                let (parent, frame) = (&self.parts.domains[parent], to_matrix(&entry.frame, "frame")?);
+                (parent.placement.compose(Transform::from_matrix(&frame)), parent.placement_matrix() * frame)
             }
-            _ => to_transform(&entry.placement, "placement")?,
+            _ => {
+                let placement = to_matrix(&entry.placement, "placement")?;
+                (Transform::from_matrix(&placement), placement)
+            }
         };
-        let world_from_model =
-            world_from_entry.compose(up_axis_rotation(entry.up, self.manifest.up.unwrap_or(self.parts.up)));
+        let up_rotation = up_axis_rotation(entry.up, self.manifest.up.unwrap_or(self.parts.up));
+        let world_from_model = world_from_entry.compose(up_rotation);
+        let exact_world_from_model = exact_world_from_entry * up_rotation.to_matrix();
         for domain in domains {
-            domain.placement = world_from_model.compose(domain.placement);
+            let exact = exact_world_from_model * domain.placement_matrix();
+            domain.set_rounded_placement(world_from_model.compose(domain.placement), &exact);
             match (&mut domain.attachment, parent) {
                 (Some(attachment), _) => {
                     attachment.parent += domain_offset;
                     domain.follows.iter_mut().for_each(|constraint| constraint.parent += domain_offset);
                 }
                 (None, Some(parent)) => {
-                    domain.attachment = Some(self.create_attachment(entry, parent, domain.placement)?);
+                    domain.attachment = Some(self.create_attachment(entry, parent, domain.placement_matrix())?);
                 }
                 (None, None) => {}
             }
@@ -267,11 +277,16 @@ impl ManifestAssembler<'_> {
         parent.map(Some).ok_or_else(|| invalid("parent", "the name of a domain of an earlier entry", name))
     }
 
-    fn create_attachment(&self, entry: &DomainEntry, parent: usize, world_from_child: Transform) -> Result<Attachment> {
+    fn create_attachment(
+        &self,
+        entry: &DomainEntry,
+        parent: usize,
+        world_from_child: Matrix4<f64>,
+    ) -> Result<Attachment> {
         let parent_domain = &self.parts.domains[parent];
-        let parent_from_world = parent_domain.placement.inverse();
+        let parent_from_world = parent_domain.placement_matrix().try_inverse();
         let singular_placement = || invalid("parent", "a parent whose placement has an inverse", &parent_domain.name);
-        let frame = parent_from_world.ok_or_else(singular_placement)?.compose(world_from_child);
+        let frame = Transform::from_matrix(&(parent_from_world.ok_or_else(singular_placement)? * world_from_child));
         let vertices = match &entry.parent_vertices {
             Some(vertices) => vertices.clone(),
             None => nearest_vertices(&self.parts.shapes[parent_domain.shape], frame),
@@ -380,7 +395,8 @@ fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result
     };
     let loaded = if file.is_empty() { Modes::rigid().into() } else { modes::read(files, file)? };
     let new_shape = Shape::new(shape.mesh.clone(), loaded.modes);
-    *shape = new_shape.map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
+    let new_shape = new_shape.map_err(|error| error.prefix_field(&format!("file '{file}'")))?;
+    *shape = new_shape.with_origin(shape.origin());
     for domain in &mut model.domains {
         domain.rest_q.clear();
         domain.metadata.eigenvalues.clone_from(&loaded.eigenvalues);
@@ -405,11 +421,10 @@ fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
         return Vec::new();
     }
     let origin = frame.translation();
-    let rest_positions = shape.mesh.rest_positions();
-    let squared_distance =
-        |vertex: u32| (nalgebra::Vector3::from(rest_positions[vertex as usize]).cast::<f64>() - origin).norm_squared();
-    let mut vertices: Vec<u32> = (0..rest_positions.len() as u32).collect();
-    vertices.sort_by(|a, b| squared_distance(*a).total_cmp(&squared_distance(*b)));
+    let squared_distances: Vec<f64> =
+        shape.exact_positions().map(|position| (nalgebra::Vector3::from(position) - origin).norm_squared()).collect();
+    let mut vertices: Vec<u32> = (0..squared_distances.len() as u32).collect();
+    vertices.sort_by(|a, b| squared_distances[*a as usize].total_cmp(&squared_distances[*b as usize]));
     vertices.truncate(DEFAULT_ATTACHMENT_VERTICES);
     vertices.sort_unstable();
     vertices

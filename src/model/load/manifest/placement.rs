@@ -1,6 +1,6 @@
 //! Placements in `scene.toml`: translation, rotation and scale, or a matrix.
 
-use nalgebra::{Matrix3, Quaternion, Rotation3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix3x4, Matrix4, Quaternion, Rotation3, Unit, UnitQuaternion, Vector3};
 
 use crate::domain::Transform;
 use crate::error::{Result, invalid};
@@ -32,14 +32,18 @@ impl Placement {
     /// # Errors
     /// `Invalid` with the keys if they conflict or one is missing, and with the entry of the matrix if a number is not
     /// finite.
-    pub(super) fn to_transform(&self) -> Result<Transform> {
+    pub(super) fn to_matrix(&self) -> Result<Matrix4<f64>> {
         let components =
             [self.translation.is_some(), self.axis.is_some(), self.quaternion.is_some(), self.scale.is_some()];
-        let transform = match self.matrix {
+        let matrix = match self.matrix {
             Some(_) if components.contains(&true) || self.degrees.is_some() => {
                 return Err(invalid("matrix", "either a matrix or translation, rotation and scale", "both"));
             }
-            Some(entries) => Transform(entries.map(|entry| entry as f32)),
+            Some(entries) => {
+                let mut matrix = Matrix4::identity();
+                matrix.fixed_view_mut::<3, 4>(0, 0).copy_from(&Matrix3x4::from_row_slice(&entries));
+                matrix
+            }
             None => {
                 let scale = match self.scale {
                     None => [1.0; 3],
@@ -47,10 +51,12 @@ impl Placement {
                     Some(Scale::PerAxis(factors)) => factors,
                 };
                 let linear = self.rotation()?.into_inner() * Matrix3::from_diagonal(&scale.into());
-                Transform::from_parts(&linear, &self.translation.unwrap_or_default().into())
+                let mut matrix = linear.to_homogeneous();
+                matrix.fixed_view_mut::<3, 1>(0, 3).copy_from_slice(&self.translation.unwrap_or_default());
+                matrix
             }
         };
-        Transform::new(transform.0)
+        Transform::new(Transform::from_matrix(&matrix).0).map(|_| matrix)
     }
 
     fn rotation(&self) -> Result<Rotation3<f64>> {
@@ -90,7 +96,7 @@ mod tests {
 
     fn parse(text: &str) -> Result<Transform> {
         let placement: Placement = toml::from_str(text).map_err(|error| invalid("toml", "TOML", error.message()))?;
-        placement.to_transform()
+        placement.to_matrix().map(|matrix| Transform::from_matrix(&matrix))
     }
 
     fn is_close(a: Transform, b: [f32; 12]) -> bool {

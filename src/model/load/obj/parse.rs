@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, HashMap};
 
 use crate::error::{Error, Result, invalid};
-use crate::load::polygons::{Corner, NO_INDEX, PolygonMesh};
+use crate::load::polygons::{Corner, NO_INDEX, PolygonMesh, within_f32};
 use crate::load::text::{lines, without_byte_order_mark};
 use crate::load::values::{CorrectedValue, MISSING_COLOR};
 use crate::memory::TemporaryReservation;
@@ -147,7 +147,7 @@ impl Parser {
 
     /// Adds a vertex: its position and, if three or more numbers follow, its color.
     fn add_vertex<'a>(&mut self, mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<()> {
-        let position = parse_vector(words.by_ref(), "v", line)?;
+        let position = parse_position(words.by_ref(), line)?;
         let polygons = &mut self.obj.polygons;
         polygons.positions.push(position);
         let color_words: Vec<&[u8]> = words.take(4).collect();
@@ -222,6 +222,17 @@ pub(super) fn text_after_key(line: &[u8]) -> String {
 /// Parses a number, which may be infinite or not a number.
 pub(super) fn parse_number(word: &[u8]) -> Option<f32> {
     std::str::from_utf8(word).ok()?.parse().ok()
+}
+
+/// Parses the position of a vertex in f64. `line` is part of the error.
+fn parse_position<'a>(mut words: impl Iterator<Item = &'a [u8]>, line: usize) -> Result<[f64; 3]> {
+    let mut numbers = [0.0; 3];
+    for number in &mut numbers {
+        let word = words.next();
+        let parse = |word: &[u8]| -> Option<f64> { std::str::from_utf8(word).ok()?.parse().ok() };
+        *number = word.and_then(parse).map(within_f32).ok_or_else(|| number_error("v", "three numbers", word, line))?;
+    }
+    Ok(numbers)
 }
 
 /// Parses three numbers. `key` and `line` are part of the error.

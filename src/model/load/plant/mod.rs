@@ -7,6 +7,7 @@ mod structure;
 
 use std::collections::{BTreeMap, HashMap};
 
+use nalgebra::Matrix4;
 use organs::{Organ, assign_organs};
 use structure::{PlantStructure, parse_object_ids};
 
@@ -57,8 +58,8 @@ pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> R
 }
 
 /// For each object id, the positions of the corners of its faces.
-fn positions_by_object(polygons: &PolygonMesh, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f32; 3]>> {
-    let mut positions: BTreeMap<u64, Vec<[f32; 3]>> = BTreeMap::new();
+fn positions_by_object(polygons: &PolygonMesh, object_ids: &[u64]) -> BTreeMap<u64, Vec<[f64; 3]>> {
+    let mut positions: BTreeMap<u64, Vec<[f64; 3]>> = BTreeMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
         let corners = polygons.corners_of(face).iter().map(|corner| polygons.positions[corner.vertex as usize]);
         positions.entry(*object_id).or_default().extend(corners);
@@ -117,14 +118,15 @@ impl PlantBuilder<'_> {
             });
         self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
         let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };
-        self.parts.domains.push(Domain {
+        let mut domain = Domain {
             material: triangle_mesh.material,
             material_ranges: triangle_mesh.material_ranges,
-            placement: translation_transform(origin),
             attachment,
             metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },
             ..Domain::new(name, self.parts.shapes.len() - 1)
-        });
+        };
+        domain.set_placement(&Matrix4::new_translation(&origin.into()));
+        self.parts.domains.push(domain);
         Ok(())
     }
 }

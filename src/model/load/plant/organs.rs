@@ -29,7 +29,7 @@ const MAX_SAMPLED_POINTS: usize = 32;
 /// `Invalid` if the numbers of internodes and shoots differ, or an object is unknown.
 pub(super) fn assign_organs(
     structure: &PlantStructure,
-    points_by_object: &BTreeMap<u64, Vec<[f32; 3]>>,
+    points_by_object: &BTreeMap<u64, Vec<[f64; 3]>>,
 ) -> Result<HashMap<u64, Organ>> {
     let mut organs = HashMap::new();
     let internodes = structure.objects.iter().filter(|(_, kind)| *kind == "internode");
@@ -50,7 +50,7 @@ pub(super) fn assign_organs(
             "internode" => continue,
             "leaf" if organs.contains_key(id) => continue,
             "leaf" => return Err(invalid(format!("leaf {id}"), "an entry in leaves", "none")),
-            "petiole" => nearest_leaf(&centers, mean_point(points.iter().map(|point| Vector3::from(*point).cast()))),
+            "petiole" => nearest_leaf(&centers, mean_point(points.iter().map(|point| Vector3::from(*point)))),
             _ => None,
         };
         let organ = organ.or_else(|| nearest_shoot(structure, points));
@@ -90,9 +90,9 @@ fn nearest_leaf(centers: &[(usize, Vector3<f64>)], point: Vector3<f64>) -> Optio
 }
 
 /// The shoot whose polyline is nearest to any of the points.
-fn nearest_shoot(structure: &PlantStructure, points: &[[f32; 3]]) -> Option<Organ> {
+fn nearest_shoot(structure: &PlantStructure, points: &[[f64; 3]]) -> Option<Organ> {
     let stride = points.len().div_ceil(MAX_SAMPLED_POINTS).max(1);
-    let points: Vec<Vector3<f64>> = points.iter().step_by(stride).map(|point| Vector3::from(*point).cast()).collect();
+    let points: Vec<Vector3<f64>> = points.iter().step_by(stride).map(|point| Vector3::from(*point)).collect();
     let squared_distance = |shoot: &usize| {
         let polyline = &structure.shoots[*shoot].vertices;
         points.iter().map(|point| squared_distance_to_polyline(polyline, point)).fold(f64::INFINITY, f64::min)

@@ -2,6 +2,8 @@
 
 use ply_rs_bw::ply::{Property, PropertyAccess, PropertyAccessResult, ScalarType};
 
+use crate::load::polygons::within_f32;
+
 /// The properties of one element. Numbers of all types are converted to f64, which is exact for those of PLY.
 pub(super) trait PlyElement: PropertyAccess {
     /// Sets a property with one number. `full` is the value of a full channel, if the property is a color.
@@ -14,7 +16,7 @@ pub(super) trait PlyElement: PropertyAccess {
 /// A vertex. A property that the file does not have is 0.
 #[derive(Debug, Default, Clone, PartialEq)]
 pub(super) struct PlyVertex {
-    pub(super) position: [f32; 3],
+    pub(super) position: [f64; 3],
     pub(super) normal: [f32; 3],
     pub(super) uv: [f32; 2],
     /// 0 to 1, or any number in a file whose colors are floating-point numbers.
@@ -37,10 +39,11 @@ pub(super) struct Skipped;
 
 impl PlyElement for PlyVertex {
     fn set_scalar(&mut self, name: &str, value: f64, full: f64) {
+        if let Some(axis) = ["x", "y", "z"].iter().position(|axis| *axis == name) {
+            self.position[axis] = within_f32(value);
+            return;
+        }
         let target = match name {
-            "x" => &mut self.position[0],
-            "y" => &mut self.position[1],
-            "z" => &mut self.position[2],
             "nx" => &mut self.normal[0],
             "ny" => &mut self.normal[1],
             "nz" => &mut self.normal[2],

@@ -38,7 +38,7 @@ fn parse(bytes: &[u8]) -> Result<PlyReader> {
 fn ascii_and_binary_files_give_the_same_mesh() {
     for bytes in [ascii().into_bytes(), ascii().replace('\n', "\r\n").into_bytes(), binary(true), binary(false)] {
         let PlyReader { polygons, remarks, .. } = parse(&bytes).expect("a valid file");
-        assert_eq!(polygons.positions, POSITIONS);
+        assert_eq!(polygons.positions, POSITIONS.map(|position| position.map(f64::from)));
         assert_eq!(polygons.colors[3], [1.0; 3]);
         assert_eq!(polygons.corners_of(1).iter().map(|corner| corner.vertex).collect::<Vec<_>>(), [0, 2, 3]);
         assert!(remarks.is_empty(), "{remarks:?}");
@@ -119,7 +119,7 @@ fn layouts_of_texts_give_the_same_mesh() {
     };
     for line_end in ["\r", "\r\n", "\n"] {
         let position = parse(&header(line_end)).expect("a valid file").polygons.positions[0];
-        assert_eq!(position, [f32::from_bits(10), 0.0, 0.0], "{line_end:?}");
+        assert_eq!(position, [f64::from(f32::from_bits(10)), 0.0, 0.0], "{line_end:?}");
     }
 }
 

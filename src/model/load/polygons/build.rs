@@ -4,13 +4,15 @@ use std::collections::HashMap;
 
 use super::triangulate::{Triangulation, triangulate};
 use super::{Corner, NO_INDEX, PolygonMesh};
-use crate::domain::{Corners, CreaseAngle, MaterialRange, Mesh, split_at_creases};
+use crate::domain::{Corners, CreaseAngle, MaterialRange, Mesh, RestOrigin, split_at_creases};
 use crate::error::Result;
 
 /// A triangle mesh and its materials, as indices into [`PolygonMesh::materials`].
 #[derive(Debug)]
 pub(in crate::load) struct TriangleMesh {
     pub(in crate::load) mesh: Mesh,
+    /// The point that the positions of the mesh are relative to.
+    pub(in crate::load) origin: [f64; 3],
     /// The material of the first triangle.
     pub(in crate::load) material: usize,
     /// The ranges of all materials; empty if there is only one material.
@@ -19,13 +21,16 @@ pub(in crate::load) struct TriangleMesh {
     inexact_polygons: usize,
 }
 
-/// Builds a mesh from all faces. Its vertices are all `v` lines in file order, whether referenced or not.
+/// Builds a mesh from all faces. Its vertices are all `v` lines in file order, whether referenced or not. They are
+/// relative to an origin of their own if f32 would round them too coarsely ([`RestOrigin`]).
 ///
 /// # Errors
 /// `Invalid` as for [`Mesh::new`].
 pub(in crate::load) fn build_all_faces(polygons: &PolygonMesh, crease_angle: CreaseAngle) -> Result<TriangleMesh> {
     let faces: Vec<usize> = (0..polygons.faces.len()).collect();
-    let mut builder = MeshBuilder { rest_positions: polygons.positions.clone(), ..MeshBuilder::new(polygons) };
+    let drawn = polygons.corners.iter().map(|corner| corner.vertex as usize);
+    let RestOrigin { origin, positions } = RestOrigin::choose(&polygons.positions, drawn);
+    let mut builder = MeshBuilder { rest_positions: positions, origin, ..MeshBuilder::new(polygons) };
     builder.add_faces(&faces);
     builder.finish(crease_angle)
 }
@@ -40,24 +45,19 @@ pub(in crate::load) fn build_faces(
     origin: [f64; 3],
     crease_angle: CreaseAngle,
 ) -> Result<TriangleMesh> {
-    let used_vertices = UsedVertices { new_indices: HashMap::new(), origin };
-    let mut builder = MeshBuilder { used_vertices: Some(used_vertices), ..MeshBuilder::new(polygons) };
+    let mut builder = MeshBuilder { new_indices: Some(HashMap::new()), origin, ..MeshBuilder::new(polygons) };
     builder.add_faces(faces);
     builder.finish(crease_angle)
-}
-
-/// The vertices that [`build_faces`] uses.
-struct UsedVertices {
-    /// Index in the triangle mesh by index in the polygon mesh.
-    new_indices: HashMap<u32, u32>,
-    origin: [f64; 3],
 }
 
 /// Collects the corners and triangles of the faces of one mesh.
 struct MeshBuilder<'a> {
     polygons: &'a PolygonMesh,
-    /// `None` if the mesh has all vertices of the file.
-    used_vertices: Option<UsedVertices>,
+    /// Index in the triangle mesh by index in the polygon mesh, for the vertices so far. `None` if the mesh has all
+    /// vertices of the file.
+    new_indices: Option<HashMap<u32, u32>>,
+    /// The point that `rest_positions` are relative to.
+    origin: [f64; 3],
     rest_positions: Vec<[f32; 3]>,
     /// Index of each corner in `corners`.
     corner_indices: HashMap<Corner, u32>,
@@ -85,7 +85,8 @@ impl<'a> MeshBuilder<'a> {
     fn new(polygons: &'a PolygonMesh) -> Self {
         Self {
             polygons,
-            used_vertices: None,
+            new_indices: None,
+            origin: [0.0; 3],
             rest_positions: Vec::new(),
             corner_indices: HashMap::new(),
             corners: Vec::new(),
@@ -112,8 +113,9 @@ impl<'a> MeshBuilder<'a> {
 
     fn add_face(&mut self, face: usize) {
         let corners = self.polygons.corners_of(face);
-        let positions: Vec<_> = corners.iter().map(|corner| self.polygons.positions[corner.vertex as usize]).collect();
         let corner_indices: Vec<u32> = corners.iter().map(|corner| self.corner_index(*corner)).collect();
+        let position = |corner: &u32| self.rest_positions[self.corner_vertices[*corner as usize] as usize];
+        let positions: Vec<_> = corner_indices.iter().map(position).collect();
         let Triangulation { triangles, is_inexact } = triangulate(&positions);
         self.inexact_polygons += usize::from(is_inexact);
         for triangle in triangles {
@@ -137,10 +139,10 @@ impl<'a> MeshBuilder<'a> {
 
     /// Returns the index in the mesh of a vertex of the file. [`build_faces`] adds a vertex on the first call for it.
     fn vertex_index(&mut self, file_vertex: u32) -> u32 {
-        let Some(UsedVertices { new_indices, origin }) = &mut self.used_vertices else { return file_vertex };
+        let Some(new_indices) = &mut self.new_indices else { return file_vertex };
         *new_indices.entry(file_vertex).or_insert_with(|| {
             let position = self.polygons.positions[file_vertex as usize];
-            self.rest_positions.push([0, 1, 2].map(|axis| (f64::from(position[axis]) - origin[axis]) as f32));
+            self.rest_positions.push([0, 1, 2].map(|axis| (position[axis] - self.origin[axis]) as f32));
             self.rest_positions.len() as u32 - 1
         })
     }
@@ -153,7 +155,8 @@ impl<'a> MeshBuilder<'a> {
         let mesh =
             Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?
                 .with_inner_edges(self.inner_edges)?;
-        Ok(TriangleMesh { mesh, material, material_ranges, inexact_polygons: self.inexact_polygons })
+        let (origin, inexact_polygons) = (self.origin, self.inexact_polygons);
+        Ok(TriangleMesh { mesh, origin, material, material_ranges, inexact_polygons })
     }
 
     /// The normals of the corners. Corners whose normal is missing or zero in the file are split at creases.
@@ -206,7 +209,8 @@ mod tests {
     fn build_all_faces_keeps_all_v_lines_in_file_order() {
         let obj = parse_squares();
         let mesh = build_all_faces(&obj, CreaseAngle::default()).expect("a valid OBJ file").mesh;
-        assert_eq!(mesh.rest_positions(), obj.positions);
+        let positions: Vec<[f64; 3]> = mesh.rest_positions().iter().map(|position| position.map(f64::from)).collect();
+        assert_eq!(positions, obj.positions);
         // First both faces of material b, then the face of material a.
         assert_eq!(
             mesh.corners().vertices,

@@ -15,6 +15,12 @@ use crate::memory::TemporaryReservation;
 /// The index of a missing texture coordinate or normal of a corner.
 pub(super) const NO_INDEX: u32 = u32::MAX;
 
+/// A coordinate in f64. A number beyond the range of f32 becomes infinite, because positions are stored as f32.
+pub(super) const fn within_f32(number: f64) -> f64 {
+    let rounded = number as f32;
+    if rounded.is_finite() { number } else { rounded as f64 }
+}
+
 /// One corner of a polygon, as indices into the positions, texture coordinates and normals of the mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) struct Corner {
@@ -44,8 +50,9 @@ pub(super) struct Face {
 /// Polygons with shared vertices. The indices and numbers are validated by [`PolygonMesh::validate`].
 #[derive(Debug, Default)]
 pub(super) struct PolygonMesh {
-    /// Rest positions, in the order of the file.
-    pub(super) positions: Vec<[f32; 3]>,
+    /// Rest positions, in the order of the file. In f64, because a model far from its origin is centered before its
+    /// positions are rounded to f32.
+    pub(super) positions: Vec<[f64; 3]>,
     /// Texture coordinates with (0, 0) at the top left.
     pub(super) uvs: Vec<[f32; 2]>,
     pub(super) normals: Vec<[f32; 3]>,
@@ -79,17 +86,23 @@ pub(in crate::load) const fn build_bytes(vertices: usize, corners: usize) -> u64
     BUILD_BYTES_PER_CORNER * corners as u64 + BUILD_BYTES_PER_VERTEX * vertices as u64
 }
 
-/// Largest memory in bytes of the lists of a mesh, whose capacity is at most twice their length: numbers of positions,
-/// normals and colors together, of texture coordinates, of faces and of corners.
-pub(in crate::load) const fn list_bytes(vectors: usize, uvs: usize, faces: usize, corners: usize) -> u64 {
-    let vector_bytes = (12 * vectors as u64).saturating_add(8 * uvs as u64);
+/// Largest memory in bytes of the lists of a mesh, whose capacity is at most twice their length: numbers of positions
+/// (f64), of normals and colors together (f32), of texture coordinates, of faces and of corners.
+pub(in crate::load) const fn list_bytes(
+    positions: usize,
+    vectors: usize,
+    uvs: usize,
+    faces: usize,
+    corners: usize,
+) -> u64 {
+    let vector_bytes = (24 * positions as u64).saturating_add(12 * vectors as u64).saturating_add(8 * uvs as u64);
     let face_bytes = (size_of::<Face>() * faces) as u64 + (size_of::<Corner>() * corners) as u64;
     vector_bytes.saturating_add(face_bytes).saturating_mul(2)
 }
 
 impl PolygonMesh {
     /// A mesh without faces, whose faces will have one material without a name.
-    pub(super) fn with_one_material(positions: Vec<[f32; 3]>) -> Self {
+    pub(super) fn with_one_material(positions: Vec<[f64; 3]>) -> Self {
         Self { positions, materials: vec![String::new()], ..Self::default() }
     }
 
@@ -102,8 +115,8 @@ impl PolygonMesh {
     /// Reserves the memory of the lists.
     fn reserve_lists(&mut self) -> Result<()> {
         let Some(memory) = &mut self.memory else { return Ok(()) };
-        let vectors = self.positions.len() + self.normals.len() + self.colors.len();
-        let bytes = list_bytes(vectors, self.uvs.len(), self.faces.len(), self.corners.len());
+        let vectors = self.normals.len() + self.colors.len();
+        let bytes = list_bytes(self.positions.len(), vectors, self.uvs.len(), self.faces.len(), self.corners.len());
         // Half as much again, so that the reservation grows rarely.
         if bytes > memory.bytes() { memory.grow_to(bytes + bytes / 2) } else { Ok(()) }
     }

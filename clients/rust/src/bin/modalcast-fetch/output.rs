@@ -41,6 +41,8 @@ pub(crate) struct Summary {
     looks: BTreeSet<String>,
     /// The largest distance of a vertex below the ground in meters.
     below_ground: f64,
+    /// Number of frames whose camera was moved, because no domain was in the view that frames the rest bounds.
+    reframed_count: u64,
 }
 
 impl Summary {
@@ -55,6 +57,7 @@ impl Summary {
             stages: StageSamples::default(),
             looks: BTreeSet::new(),
             below_ground: 0.0,
+            reframed_count: 0,
         }
     }
 
@@ -69,10 +72,11 @@ impl Summary {
         self.stages.add(reply.stages);
     }
 
-    /// Adds the look of a frame, and how far its vertices lie below the ground.
+    /// Adds the look of a frame, how far its vertices lie below the ground, and whether its camera was moved.
     pub(crate) fn add_frame_info(&mut self, frame: &Frame) {
         self.looks.extend(frame.look.as_ref().map(FrameLook::to_string));
         self.below_ground = self.below_ground.max(frame.below_ground);
+        self.reframed_count += u64::from(frame.reframed);
     }
 
     /// Replies per second from the first to the last reply; 0 for fewer than two replies.
@@ -100,6 +104,7 @@ impl Summary {
             }
             if !self.looks.is_empty() {
                 (summary["looks"], summary["below_ground"]) = (json!(self.looks), json!(self.below_ground));
+                summary["reframed"] = json!(self.reframed_count);
             }
             println!("{summary}");
             return;
@@ -113,6 +118,10 @@ impl Summary {
             println!("  {stage:8} {milliseconds:8.3} ms (median)");
         }
         self.looks.iter().for_each(|look| println!("  look     {look}"));
+        if self.reframed_count > 0 {
+            let count = self.reframed_count;
+            println!("  remark   no domain is in the view of the rest state: {count} frames show them where they are");
+        }
         if self.below_ground > 0.0 {
             println!("  remark   vertices lie up to {:.4} m below the ground", self.below_ground);
         }

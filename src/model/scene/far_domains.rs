@@ -1,0 +1,140 @@
+//! Domains that are far from the origin of their own frame, or from the scene's origin, so that f32 alone would round
+//! their rest state too coarsely.
+//!
+//! Such a scene differs from others in two ways. Rest positions are relative to an origin of their shape
+//! ([`Shape::origin`]), which is a part of the transforms of the state ([`super::TransformRoots::pivot_of`]). And the
+//! rest state has
+//! [`super::FloatingOrigins`], as after a step with f64 translations. All other scenes have neither.
+
+use nalgebra::{Matrix4, Point3};
+
+use super::{BoundingBox, SceneParts};
+use crate::domain::{Domain, MAX_DIAGONALS, Mesh, Shape, origin_of_bounds};
+use crate::error::Result;
+
+/// The largest distance of a domain in diagonals of its own bounds. It is large, because far domains have floating
+/// origins of their own, which a frame pays for with a pass over all vertices on the host, and because only the place
+/// of the domain is rounded, not its shape: by at most 2^-24 x 2^16 = 0.4 % of its diagonal.
+const MAX_OWN_DIAGONALS: f64 = 65_536.0;
+
+/// The bounds that decide whether a domain is far.
+struct Extents {
+    /// Per shape, the bounds of x0 of the drawn vertices.
+    shapes: Vec<BoundingBox>,
+    /// Per domain, the bounds at rest.
+    domains: Vec<BoundingBox>,
+    /// Diagonal of the bounds of all domains.
+    diagonal: f64,
+}
+
+impl Extents {
+    fn new(shapes: &[Shape], domains: &[Domain]) -> Self {
+        let shapes: Vec<BoundingBox> = shapes.iter().map(|shape| drawn_bounds(&shape.mesh, shape.origin())).collect();
+        let world_bounds = |domain: &Domain| transform_bounds(&domain.placement_matrix(), shapes[domain.shape]);
+        let domains: Vec<BoundingBox> = domains.iter().map(world_bounds).collect();
+        let bounds = domains.iter().fold(BoundingBox::EMPTY, |all, bounds| all.union(*bounds));
+        Self { shapes, domains, diagonal: bounds.diagonal() }
+    }
+
+    /// The largest coordinate that f32 represents well enough for a domain, in scene units.
+    fn largest_coordinate(&self, domain: usize) -> f64 {
+        let limit = MAX_DIAGONALS * self.diagonal;
+        match self.domains[domain].diagonal() {
+            own_diagonal if own_diagonal.is_normal() => limit.min(MAX_OWN_DIAGONALS * own_diagonal),
+            _ => limit,
+        }
+    }
+}
+
+/// Decides which domains are far, and removes the origins of the shapes and the remainders of the placements that do
+/// not matter. Centers shapes that are far without having an origin. Returns a remark if any domain is far, else
+/// `None`.
+///
+/// # Errors
+/// `Invalid` if a position exceeds the range of f32.
+pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<String>> {
+    let SceneParts { shapes, domains, .. } = parts;
+    let extents = Extents::new(shapes, domains);
+    let mut is_far_shape = vec![false; shapes.len()];
+    // Per far domain, its index and its largest coordinate.
+    let mut far_domains: Vec<(usize, f64)> = Vec::new();
+    for (index, domain) in domains.iter_mut().enumerate() {
+        let limit = extents.largest_coordinate(index);
+        // A scene of a single point has no size to compare with.
+        let is_far = |reach: f64| limit.is_normal() && reach.is_finite() && reach > limit;
+        // A uniform scale, or a mean of the scales of the axes.
+        let scale = domain.placement.linear().norm() / 3.0_f64.sqrt();
+        let shape_reach = scale * largest_coordinate(extents.shapes[domain.shape]);
+        let reach = shape_reach.max(largest_coordinate(extents.domains[index]));
+        is_far_shape[domain.shape] |= is_far(shape_reach);
+        if is_far(reach) {
+            far_domains.push((index, reach));
+        } else {
+            domain.placement_remainder = [0.0; 12];
+        }
+    }
+    for (index, shape) in shapes.iter_mut().enumerate() {
+        let origin = match is_far_shape[index] {
+            false => [0.0; 3],
+            true if shape.is_centered() => shape.origin(),
+            true => origin_of_bounds([extents.shapes[index].min, extents.shapes[index].max]),
+        };
+        if origin != shape.origin() {
+            shape.set_origin(origin)?;
+        }
+    }
+    Ok(far_remark(parts, &far_domains))
+}
+
+/// A remark on the error of steps with f32 transforms.
+///
+/// Let d be the largest coordinate of a domain. A client that rounds T = (A, t) to f32 changes each entry of A by at
+/// most 2^-25, and t, which is at most 2 d, by at most 2^-23 d. On each axis, T x0 then changes by at most
+/// 3 x 2^-25 d + 2^-23 d, which is less than 2^-22 d.
+fn far_remark(parts: &SceneParts, far_domains: &[(usize, f64)]) -> Option<String> {
+    let (index, reach) = far_domains.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let others = far_domains.len() - 1;
+    let more = if others > 0 { format!(" and {others} other domains are") } else { " is".to_owned() };
+    let [distance, error] = [*reach, *reach * 2.0_f64.powi(-22)].map(|length| two_digits(length * parts.unit));
+    Some(format!(
+        "'{}'{more} far from the origin ({distance} m): the rest state and f64 poses are exact, but a step with f32 \
+         transforms places it with an error of up to {error} m on each axis",
+        parts.domains[*index].name
+    ))
+}
+
+/// A number rounded to two significant digits.
+fn two_digits(number: f64) -> f64 {
+    format!("{number:.1e}").parse().unwrap_or(number)
+}
+
+/// The bounds of the vertices that triangles use, in f64.
+pub(super) fn drawn_bounds(mesh: &Mesh, origin: [f64; 3]) -> BoundingBox {
+    let mut bounds = BoundingBox::EMPTY;
+    for position in mesh.drawn_positions() {
+        bounds.include(std::array::from_fn(|axis| f64::from(position[axis]) + origin[axis]));
+    }
+    bounds
+}
+
+/// The bounds of a transformed box.
+pub(super) fn transform_bounds(matrix: &Matrix4<f64>, bounds: BoundingBox) -> BoundingBox {
+    let mut transformed = BoundingBox::EMPTY;
+    for corner in bounds.corners() {
+        transformed.include(transform_point(matrix, corner.coords.into()));
+    }
+    transformed
+}
+
+/// An affine transform of a point.
+pub(super) fn transform_point(matrix: &Matrix4<f64>, point: [f64; 3]) -> [f64; 3] {
+    matrix.transform_point(&Point3::from(point)).coords.into()
+}
+
+/// The largest magnitude of a coordinate in a box.
+fn largest_coordinate(bounds: BoundingBox) -> f64 {
+    bounds.min.iter().chain(&bounds.max).fold(0.0, |largest: f64, coordinate| largest.max(coordinate.abs()))
+}
+
+#[cfg(test)]
+mod tests;
