@@ -71,7 +71,7 @@ def tree() -> tuple[StateLayout, Kinematics]:
     points: dict[int, AttachmentPoints] = {}
     for joint in layout.domains:
         if has_fit(joint, layout) and joint.parent is not None:
-            rest = random.uniform(-1, 1, (4, 3)).astype(np.float32)
+            rest = random.uniform(-1, 1, (4, 3))
             modes = 0.2 * random.uniform(-1, 1, (12, layout.domains[joint.parent].rank)).astype(np.float32)
             points[joint.index] = AttachmentPoints(rest, modes)
     return layout, Kinematics(layout, points)

@@ -26,7 +26,7 @@ _COLLINEAR = 1e-9
 class AttachmentPoints:
     """The k parent vertices to which a domain is attached: rest positions k x 3, and rows of U, 3k x r."""
 
-    rest_positions: F32
+    rest_positions: F64
     modes: F32
 
 

@@ -14,7 +14,9 @@ from modalcast._chunks import malformed
 from modalcast._types import F32, F64, U32, Bytes
 from modalcast.v1 import scenes_pb2
 
-ArrayName: TypeAlias = Literal["indices", "corner_vertices", "rest_positions", "uvs", "rest_normals", "modes"]
+ArrayName: TypeAlias = Literal[
+    "indices", "corner_vertices", "rest_positions", "uvs", "rest_normals", "modes", "centered_positions"
+]
 
 # Value of the enum `Array`, type, and number of columns. The modes have `rank` columns.
 _ARRAYS: dict[str, tuple[scenes_pb2.Array, str, int | None]] = {
@@ -24,6 +26,7 @@ _ARRAYS: dict[str, tuple[scenes_pb2.Array, str, int | None]] = {
     "uvs": (scenes_pb2.ARRAY_UVS, "<f4", 2),
     "rest_normals": (scenes_pb2.ARRAY_REST_NORMALS, "<f4", 3),
     "modes": (scenes_pb2.ARRAY_MODES, "<f4", None),
+    "centered_positions": (scenes_pb2.ARRAY_CENTERED_POSITIONS, "<f4", 3),
 }
 ARRAY_NAMES = {number: name for name, (number, _, _) in _ARRAYS.items()}
 ALPHA_MODES = {
@@ -46,9 +49,12 @@ class Shape:
         eigenvalues: Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.
         hashes: SHA-256 of the arrays by name, if hashes were requested.
         sizes: Sizes of the arrays in bytes, by name.
+        origin: The point c that "centered_positions" are relative to, in scene units and in the domain's own frame.
+            Zero unless f32 would round x0 too coarsely.
         arrays: "indices" (m x 3, corners), "corner_vertices" (one vertex per corner), "rest_positions" (n x 3, scene
             units, in the domain's own frame), "uvs" (two per corner), "rest_normals" (three per corner) and "modes"
-            (U: 3n x r, scene units per unit of q).
+            (U: 3n x r, scene units per unit of q). "centered_positions" (n x 3, x0 - c) is empty if the shape has no
+            origin.
     """
 
     index: int
@@ -59,6 +65,7 @@ class Shape:
     eigenvalues: F64
     hashes: Mapping[str, bytes]
     sizes: Mapping[str, int]
+    origin: F64 = field(default_factory=lambda: np.zeros(3))
     arrays: dict[str, F32 | U32] = field(default_factory=dict[str, "F32 | U32"], repr=False)
 
     @property
@@ -66,6 +73,13 @@ class Shape:
         """Vertices of each triangle, m x 3. Needs the arrays "indices" and "corner_vertices"."""
         faces = self.arrays["corner_vertices"][self.arrays["indices"].astype(np.intp)]
         return faces.astype(np.uint32, copy=False)
+
+    @property
+    def exact_positions(self) -> F64:
+        """x0 in f64, n x 3. Needs the array "centered_positions" if the shape has an origin, else "rest_positions"."""
+        if self.origin.any():
+            return self.arrays["centered_positions"] + self.origin
+        return self.arrays["rest_positions"].astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +134,8 @@ class Domain:
         shape: Index of its shape.
         material: Index of its material, unless `material_ranges` is set.
         material_ranges: Pairs of first triangle and material; empty if all triangles have `material`.
+        exact_placement: `placement` in f64; None unless the domain is so far from the scene's origin that f32 rounds
+            it.
     """
 
     index: int
@@ -139,6 +155,7 @@ class Domain:
     shape: int
     material: int
     material_ranges: tuple[tuple[int, int], ...]
+    exact_placement: F64 | None = None
 
     @property
     def frequencies(self) -> F64:
@@ -239,6 +256,7 @@ def decode_array(shape: Shape, name: str, data: Bytes) -> F32 | U32:
 
 def shape_from_message(message: scenes_pb2.ShapeDescription) -> Shape:
     """Converts a shape without arrays."""
+    origin = _numbers(f"describe.shapes[{message.shape}].origin", message.origin, 3)
     known = [array for array in message.arrays if array.array in ARRAY_NAMES]
     return Shape(
         index=message.shape,
@@ -249,6 +267,7 @@ def shape_from_message(message: scenes_pb2.ShapeDescription) -> Shape:
         eigenvalues=np.array(message.eigenvalues, np.float64),
         hashes={ARRAY_NAMES[array.array]: array.sha256 for array in known if array.sha256},
         sizes={ARRAY_NAMES[array.array]: array.bytes for array in known},
+        origin=np.zeros(3) if origin is None else origin,
     )
 
 
@@ -287,6 +306,7 @@ def domain_from_message(message: scenes_pb2.DomainDescription, shapes: Mapping[i
     eigenvalues = np.array(message.eigenvalues.values) if message.HasField("eigenvalues") else shape.eigenvalues
     rest_q = np.frombuffer(message.rest_q, "<f4") if message.rest_q else np.zeros(shape.rank, np.float32)
     placement = _matrix(f"{field_}.placement", message.placement)
+    exact_placement = _numbers(f"{field_}.exact_placement", message.exact_placement, 12)
     if placement is None or len(rest_q) != shape.rank:
         raise malformed(field_, f"a placement and {shape.rank} coordinates", f"{len(rest_q)} coordinates")
     return Domain(
@@ -308,7 +328,15 @@ def domain_from_message(message: scenes_pb2.DomainDescription, shapes: Mapping[i
         shape=message.shape,
         material=message.material,
         material_ranges=tuple((part.first_triangle, part.material) for part in message.material_ranges),
+        exact_placement=None if exact_placement is None else exact_placement.reshape(3, 4),
     )
+
+
+def _numbers(name: str, given: Sequence[float], count: int) -> F64 | None:
+    """A list of `count` numbers; None for an empty list."""
+    if len(given) not in (0, count):
+        raise malformed(name, f"none or {count} numbers", str(len(given)))
+    return np.array(given, np.float64) if len(given) > 0 else None
 
 
 def _matrix(name: str, data: bytes) -> F32 | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,16 +31,24 @@ class StateLayout:
         roots: Indices of the domains that are their own roots.
         root_from_domain: 4x4 for each domain; the identity for a root.
         is_attached: Whether each domain is a root that is attached to a parent.
+        scene_origin: World position of the scene's origin in meters.
+        unit: Meters per scene unit.
     """
 
-    def __init__(self, domains: Domains, *, has_packed_q: bool) -> None:
+    def __init__(
+        self, domains: Domains, *, has_packed_q: bool, scene_origin: Sequence[float] = (0, 0, 0), unit: float = 1
+    ) -> None:
         """Computes the layout.
 
         Args:
             domains: The domains of the scene.
             has_packed_q: Whether the server has FEATURE_PACKED_Q.
+            scene_origin: World position of the scene's origin in meters.
+            unit: Meters per scene unit.
         """
         self.domains = domains
+        self.scene_origin: F64 = np.array(scene_origin, np.float64)
+        self.unit = unit
         self.first_coordinate: list[int] = []
         self.owner: list[int] = []
         self.coordinate_count = 0
@@ -109,6 +118,13 @@ class SceneState:
     def transform_of(self, domain: int | str | Domain) -> F32:
         """world_from_domain of a domain, 3x4."""
         return self.transforms[self.layout.domains[domain].index]
+
+    @property
+    def scene_transforms(self) -> F64:
+        """world_from_domain of every domain relative to the scene's origin: domains x 3 x 4."""
+        transforms = self.transforms.astype(np.float64)
+        transforms[:, :, 3] += (self.origins - self.layout.scene_origin) / self.layout.unit
+        return transforms
 
 
 class StateDecoder:

@@ -11,7 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from modalcast._types import F32, U32, Vector, affine, to_f32, to_f64, vector3
+from modalcast._types import F32, F64, U32, Vector, affine, to_f32, to_f64, vector3
 from modalcast.v1 import scenes_pb2
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -20,12 +20,15 @@ Progress: TypeAlias = Callable[[int, int], None]
 _CHUNK_BYTES = 512 << 10
 _MAX_FOLDER_DEPTH = 16
 _MAX_INDEX = 0xFFFFFFFF
+# A coordinate of more than this many diagonals of the bounds is sent in f64, because f32 would round it too coarsely.
+_MAX_DIAGONALS = 8.0
 
 
 @dataclass(frozen=True)
 class _Domain:
     message: scenes_pb2.UploadedDomain
-    arrays: tuple[F32 | U32, ...]
+    arrays: tuple[F32 | F64 | U32, ...]
+    diagonal: float
 
 
 class SceneBuilder:
@@ -60,7 +63,8 @@ class SceneBuilder:
         """Adds a domain and returns the builder.
 
         Args:
-            positions: Rest positions x0, n x 3, in scene units and in the domain's own frame.
+            positions: Rest positions x0, n x 3, in scene units and in the domain's own frame. An array of f64 keeps its
+                precision at any distance from the origin of this frame.
             faces: Vertices of the triangles, m x 3, counterclockwise seen from the front.
             modes: U, 3n x r (rows 3v, 3v + 1, 3v + 2 of vertex v) or n x 3 x r, in scene units per unit of q; None: a
                 rigid domain.
@@ -74,16 +78,19 @@ class SceneBuilder:
         Raises:
             ValueError: An array has another shape, an index is out of range, or a name occurs twice.
         """
-        positions = to_f32("positions", positions, (None, 3))
-        triangles = _faces(faces, len(positions))
-        U = _modes(modes, len(positions))
-        message = self._message(name, eigenvalues, placement, color)
-        message.vertices, message.triangles, message.rank = len(positions), len(triangles), U.shape[1]
+        x0 = to_f64("positions", positions, (None, 3))
+        rounded = to_f32("positions", positions, (None, 3))
+        triangles = _faces(faces, len(x0))
+        U = _modes(modes, len(x0))
+        diagonal = _diagonal(x0, triangles)
+        message = self._message(name, eigenvalues, placement, color, diagonal)
+        message.vertices, message.triangles, message.rank = len(x0), len(triangles), U.shape[1]
+        message.f64_positions = _needs_f64(x0[triangles], diagonal)
         if len(message.eigenvalues) not in (0, U.shape[1]):
             raise ValueError(f"eigenvalues: expected shape ({U.shape[1]},), got ({len(message.eigenvalues)},)")
         if crease_angle is not None:
             message.crease_angle = crease_angle
-        return self._append(_Domain(message, (positions, triangles, U)))
+        return self._append(_Domain(message, (x0 if message.f64_positions else rounded, triangles, U), diagonal))
 
     def add_copy(
         self, of: str, *, name: str = "", placement: ArrayLike | None = None, color: Vector | None = None
@@ -96,9 +103,10 @@ class SceneBuilder:
         """
         if of not in self._names:
             raise KeyError(f"no earlier domain is named '{of}'; the scene has {list(self._names)}")
-        message = self._message(name, None, placement, color)
+        diagonal = self._domains[self._names[of]].diagonal
+        message = self._message(name, None, placement, color, diagonal)
         message.shares_shape_with = self._names[of]
-        return self._append(_Domain(message, ()))
+        return self._append(_Domain(message, (), diagonal))
 
     def messages(self, progress: Progress | None) -> Iterator[scenes_pb2.UploadArraysRequest]:
         """The messages of the upload."""
@@ -120,7 +128,12 @@ class SceneBuilder:
                         progress(sent, total)
 
     def _message(
-        self, name: str, eigenvalues: ArrayLike | None, placement: ArrayLike | None, color: Vector | None
+        self,
+        name: str,
+        eigenvalues: ArrayLike | None,
+        placement: ArrayLike | None,
+        color: Vector | None,
+        diagonal: float,
     ) -> scenes_pb2.UploadedDomain:
         name = name or f"domain{len(self._domains)}"
         if name in self._names:
@@ -129,7 +142,7 @@ class SceneBuilder:
         if eigenvalues is not None:
             message.eigenvalues.extend(to_f64("eigenvalues", eigenvalues, (None,)).tolist())
         if placement is not None:
-            message.placement = affine("placement", placement).tobytes()
+            message.placement = _placement_bytes(placement, diagonal)
         if color is not None:
             message.color.extend(vector3("color", color))
         return message
@@ -138,6 +151,24 @@ class SceneBuilder:
         self._names[domain.message.name] = len(self._domains)
         self._domains.append(domain)
         return self
+
+
+def _diagonal(positions: F64, triangles: U32) -> float:
+    """Length of the diagonal of the bounds of the vertices that triangles use."""
+    drawn = positions[triangles.reshape(-1)]
+    return float(np.linalg.norm(np.ptp(drawn, axis=0))) if len(drawn) > 0 else 0.0
+
+
+def _needs_f64(coordinates: F64, diagonal: float) -> bool:
+    """Whether f32 rounds coordinates of an object of this size too coarsely."""
+    return coordinates.size > 0 and bool(np.abs(coordinates).max() > _MAX_DIAGONALS * diagonal > 0)
+
+
+def _placement_bytes(placement: ArrayLike, diagonal: float) -> bytes:
+    """A placement in f32, or in f64 if it is far from the origin of the scene."""
+    rounded = affine("placement", placement)
+    exact = np.asarray(placement, dtype="<f8")[:3]
+    return (exact if _needs_f64(exact[:, 3], diagonal) else rounded).tobytes()
 
 
 def _faces(faces: ArrayLike, vertex_count: int) -> U32:

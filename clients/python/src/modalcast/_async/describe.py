@@ -74,7 +74,8 @@ async def read_description(
     if cache is not None:
         for shape in description.shapes.values():
             for name in arrays:
-                shape.arrays[name] = decode_array(shape, name, contents[shape.hashes[name]])
+                content = contents[shape.hashes[name]] if name in shape.hashes else np.empty(0, np.uint8)
+                shape.arrays[name] = decode_array(shape, name, content)
     if not textures:
         return description
     with_pixels = {index: _with_pixels(texture, contents) for index, texture in description.textures.items()}
@@ -201,18 +202,26 @@ async def read_attachments(
     parents = sorted({domain.parent for domain in fitted if domain.parent is not None})
     if not parents:
         return {}
-    description = await read_description(
-        transport, scene, parents, ["rest_positions"], textures=False, hashes=False, cache=None, timeout=timeout
-    )
+
+    async def describe(domains: list[int], array: ArrayName) -> SceneDescription:
+        return await read_description(
+            transport, scene, domains, [array], textures=False, hashes=False, cache=None, timeout=timeout
+        )
+
+    description = await describe(parents, "rest_positions")
+    centered = [parent.index for parent in description.domains if description.shape_of(parent).origin.any()]
+    if centered:
+        for index, shape in (await describe(centered, "centered_positions")).shapes.items():
+            description.shapes[index].arrays.update(shape.arrays)
     points: dict[int, AttachmentPoints] = {}
     for parent in description.domains:
         children = [domain for domain in fitted if domain.parent == parent.index]
         vertices = np.unique(np.concatenate([child.attachment_vertices for child in children]))
         modes = await read_modes(transport, scene, parent.index, vertices.tolist(), timeout)
         modes = modes.reshape(len(vertices), 3, parent.rank)
-        rest_positions = description.shape_of(parent).arrays["rest_positions"]
+        rest_positions = description.shape_of(parent).exact_positions
         for child in children:
             places = np.searchsorted(vertices, child.attachment_vertices)
-            rest = rest_positions[child.attachment_vertices].astype(np.float32)
+            rest = rest_positions[child.attachment_vertices]
             points[child.index] = AttachmentPoints(rest, modes[places].reshape(-1, parent.rank))
     return points

@@ -6,6 +6,8 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
 from modalcast._common import Delivery, StepId, delivery_message
@@ -287,7 +289,8 @@ class Drive:
     async def _load_state(self) -> None:
         """Takes the first values from the current state of the server."""
         state = await self._read_state()
-        self._values = StepValues(self._layout, self._kinematics, state.q, state.transforms)
+        transforms = state.scene_transforms.astype(np.float32)
+        self._values = StepValues(self._layout, self._kinematics, state.q, transforms)
 
     async def _resume(self) -> None:
         """Opens a new stream after a lost connection, and sends all values."""

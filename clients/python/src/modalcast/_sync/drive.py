@@ -8,6 +8,8 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from modalcast._common import Delivery, StepId, delivery_message
 from modalcast._step_message import StepMessage
 from modalcast._sync.streams import with_reconnect
@@ -289,7 +291,8 @@ class Drive:
     def _load_state(self) -> None:
         """Takes the first values from the current state of the server."""
         state = self._read_state()
-        self._values = StepValues(self._layout, self._kinematics, state.q, state.transforms)
+        transforms = state.scene_transforms.astype(np.float32)
+        self._values = StepValues(self._layout, self._kinematics, state.q, transforms)
 
     def _resume(self) -> None:
         """Opens a new stream after a lost connection, and sends all values."""

@@ -91,7 +91,8 @@ class Scene:
         self._timeout = timeout
         self._reconnect = reconnect
         has_packed_q = server_pb2.FEATURE_PACKED_Q in client.info.features
-        self._layout = StateLayout(self.domains, has_packed_q=has_packed_q)
+        origin, unit = self.info.origin, self.info.unit
+        self._layout = StateLayout(self.domains, has_packed_q=has_packed_q, scene_origin=origin, unit=unit)
         self._has_rgb = server_pb2.FEATURE_RGB_FRAMES in client.info.features
         self._kinematics: Kinematics | None = None
 

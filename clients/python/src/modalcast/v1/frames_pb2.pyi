@@ -245,7 +245,7 @@ class FrameChunk(_message.Message):
     def __init__(self, head: _Optional[_Union[FrameHead, _Mapping]] = ..., offset: _Optional[int] = ..., data: _Optional[bytes] = ..., shared: _Optional[_Union[_common_pb2.SharedRange, _Mapping]] = ...) -> None: ...
 
 class FrameHead(_message.Message):
-    __slots__ = ("step", "width", "height", "format", "total", "skipped", "stages", "shadow_drawn_by", "visibility_drawn_by", "picture", "camera_version", "look", "below_ground")
+    __slots__ = ("step", "width", "height", "format", "total", "skipped", "stages", "shadow_drawn_by", "visibility_drawn_by", "picture", "camera_version", "look", "below_ground", "reframed")
     STEP_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -259,6 +259,7 @@ class FrameHead(_message.Message):
     CAMERA_VERSION_FIELD_NUMBER: _ClassVar[int]
     LOOK_FIELD_NUMBER: _ClassVar[int]
     BELOW_GROUND_FIELD_NUMBER: _ClassVar[int]
+    REFRAMED_FIELD_NUMBER: _ClassVar[int]
     step: _common_pb2.StepId
     width: int
     height: int
@@ -272,7 +273,8 @@ class FrameHead(_message.Message):
     camera_version: int
     look: FrameLook
     below_ground: float
-    def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., format: _Optional[_Union[Format, str]] = ..., total: _Optional[int] = ..., skipped: _Optional[int] = ..., stages: _Optional[_Iterable[_Union[_common_pb2.StageTime, _Mapping]]] = ..., shadow_drawn_by: _Optional[_Union[DrawnBy, str]] = ..., visibility_drawn_by: _Optional[_Union[DrawnBy, str]] = ..., picture: _Optional[int] = ..., camera_version: _Optional[int] = ..., look: _Optional[_Union[FrameLook, _Mapping]] = ..., below_ground: _Optional[float] = ...) -> None: ...
+    reframed: bool
+    def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., format: _Optional[_Union[Format, str]] = ..., total: _Optional[int] = ..., skipped: _Optional[int] = ..., stages: _Optional[_Iterable[_Union[_common_pb2.StageTime, _Mapping]]] = ..., shadow_drawn_by: _Optional[_Union[DrawnBy, str]] = ..., visibility_drawn_by: _Optional[_Union[DrawnBy, str]] = ..., picture: _Optional[int] = ..., camera_version: _Optional[int] = ..., look: _Optional[_Union[FrameLook, _Mapping]] = ..., below_ground: _Optional[float] = ..., reframed: bool = ...) -> None: ...
 
 class FrameLook(_message.Message):
     __slots__ = ("preset", "antialiasing", "samples", "shadow_method", "shadow_size")

@@ -25,6 +25,7 @@ class Array(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ARRAY_UVS: _ClassVar[Array]
     ARRAY_REST_NORMALS: _ClassVar[Array]
     ARRAY_MODES: _ClassVar[Array]
+    ARRAY_CENTERED_POSITIONS: _ClassVar[Array]
 
 class AlphaMode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -43,6 +44,7 @@ ARRAY_REST_POSITIONS: Array
 ARRAY_UVS: Array
 ARRAY_REST_NORMALS: Array
 ARRAY_MODES: Array
+ARRAY_CENTERED_POSITIONS: Array
 ALPHA_MODE_UNSPECIFIED: AlphaMode
 ALPHA_MODE_OPAQUE: AlphaMode
 ALPHA_MODE_MASK: AlphaMode
@@ -185,7 +187,7 @@ class UploadArraysHeader(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., domains: _Optional[int] = ..., total_bytes: _Optional[int] = ..., unit: _Optional[float] = ..., up: _Optional[str] = ...) -> None: ...
 
 class UploadedDomain(_message.Message):
-    __slots__ = ("name", "vertices", "triangles", "rank", "shares_shape_with", "placement", "color", "eigenvalues", "crease_angle")
+    __slots__ = ("name", "vertices", "triangles", "rank", "shares_shape_with", "placement", "color", "eigenvalues", "crease_angle", "origin", "f64_positions")
     NAME_FIELD_NUMBER: _ClassVar[int]
     VERTICES_FIELD_NUMBER: _ClassVar[int]
     TRIANGLES_FIELD_NUMBER: _ClassVar[int]
@@ -195,6 +197,8 @@ class UploadedDomain(_message.Message):
     COLOR_FIELD_NUMBER: _ClassVar[int]
     EIGENVALUES_FIELD_NUMBER: _ClassVar[int]
     CREASE_ANGLE_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
+    F64_POSITIONS_FIELD_NUMBER: _ClassVar[int]
     name: str
     vertices: int
     triangles: int
@@ -204,7 +208,9 @@ class UploadedDomain(_message.Message):
     color: _containers.RepeatedScalarFieldContainer[float]
     eigenvalues: _containers.RepeatedScalarFieldContainer[float]
     crease_angle: float
-    def __init__(self, name: _Optional[str] = ..., vertices: _Optional[int] = ..., triangles: _Optional[int] = ..., rank: _Optional[int] = ..., shares_shape_with: _Optional[int] = ..., placement: _Optional[bytes] = ..., color: _Optional[_Iterable[float]] = ..., eigenvalues: _Optional[_Iterable[float]] = ..., crease_angle: _Optional[float] = ...) -> None: ...
+    origin: _containers.RepeatedScalarFieldContainer[float]
+    f64_positions: bool
+    def __init__(self, name: _Optional[str] = ..., vertices: _Optional[int] = ..., triangles: _Optional[int] = ..., rank: _Optional[int] = ..., shares_shape_with: _Optional[int] = ..., placement: _Optional[bytes] = ..., color: _Optional[_Iterable[float]] = ..., eigenvalues: _Optional[_Iterable[float]] = ..., crease_angle: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., f64_positions: bool = ...) -> None: ...
 
 class UploadArraysResponse(_message.Message):
     __slots__ = ("scene",)
@@ -313,7 +319,7 @@ class DomainDescriptions(_message.Message):
     def __init__(self, domains: _Optional[_Iterable[_Union[DomainDescription, _Mapping]]] = ...) -> None: ...
 
 class ShapeDescription(_message.Message):
-    __slots__ = ("shape", "vertices", "rank", "corners", "triangles", "eigenvalues", "arrays")
+    __slots__ = ("shape", "vertices", "rank", "corners", "triangles", "eigenvalues", "arrays", "origin")
     SHAPE_FIELD_NUMBER: _ClassVar[int]
     VERTICES_FIELD_NUMBER: _ClassVar[int]
     RANK_FIELD_NUMBER: _ClassVar[int]
@@ -321,6 +327,7 @@ class ShapeDescription(_message.Message):
     TRIANGLES_FIELD_NUMBER: _ClassVar[int]
     EIGENVALUES_FIELD_NUMBER: _ClassVar[int]
     ARRAYS_FIELD_NUMBER: _ClassVar[int]
+    ORIGIN_FIELD_NUMBER: _ClassVar[int]
     shape: int
     vertices: int
     rank: int
@@ -328,7 +335,8 @@ class ShapeDescription(_message.Message):
     triangles: int
     eigenvalues: _containers.RepeatedScalarFieldContainer[float]
     arrays: _containers.RepeatedCompositeFieldContainer[ArrayDescription]
-    def __init__(self, shape: _Optional[int] = ..., vertices: _Optional[int] = ..., rank: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., eigenvalues: _Optional[_Iterable[float]] = ..., arrays: _Optional[_Iterable[_Union[ArrayDescription, _Mapping]]] = ...) -> None: ...
+    origin: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, shape: _Optional[int] = ..., vertices: _Optional[int] = ..., rank: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., eigenvalues: _Optional[_Iterable[float]] = ..., arrays: _Optional[_Iterable[_Union[ArrayDescription, _Mapping]]] = ..., origin: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class ArrayDescription(_message.Message):
     __slots__ = ("array", "bytes", "sha256")
@@ -385,7 +393,7 @@ class TextureDescription(_message.Message):
     def __init__(self, texture: _Optional[int] = ..., name: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ...) -> None: ...
 
 class DomainDescription(_message.Message):
-    __slots__ = ("domain", "name", "shape", "material", "material_ranges", "placement", "rest_q", "parent", "attachment_frame", "attachment_vertices", "follows", "follow_frame", "shares_q_with", "eigenvalues", "notes")
+    __slots__ = ("domain", "name", "shape", "material", "material_ranges", "placement", "rest_q", "parent", "attachment_frame", "attachment_vertices", "follows", "follow_frame", "shares_q_with", "eigenvalues", "notes", "exact_placement")
     class NotesEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -408,6 +416,7 @@ class DomainDescription(_message.Message):
     SHARES_Q_WITH_FIELD_NUMBER: _ClassVar[int]
     EIGENVALUES_FIELD_NUMBER: _ClassVar[int]
     NOTES_FIELD_NUMBER: _ClassVar[int]
+    EXACT_PLACEMENT_FIELD_NUMBER: _ClassVar[int]
     domain: int
     name: str
     shape: int
@@ -423,7 +432,8 @@ class DomainDescription(_message.Message):
     shares_q_with: int
     eigenvalues: Eigenvalues
     notes: _containers.ScalarMap[str, str]
-    def __init__(self, domain: _Optional[int] = ..., name: _Optional[str] = ..., shape: _Optional[int] = ..., material: _Optional[int] = ..., material_ranges: _Optional[_Iterable[_Union[MaterialRange, _Mapping]]] = ..., placement: _Optional[bytes] = ..., rest_q: _Optional[bytes] = ..., parent: _Optional[int] = ..., attachment_frame: _Optional[bytes] = ..., attachment_vertices: _Optional[_Iterable[int]] = ..., follows: _Optional[int] = ..., follow_frame: _Optional[bytes] = ..., shares_q_with: _Optional[int] = ..., eigenvalues: _Optional[_Union[Eigenvalues, _Mapping]] = ..., notes: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    exact_placement: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, domain: _Optional[int] = ..., name: _Optional[str] = ..., shape: _Optional[int] = ..., material: _Optional[int] = ..., material_ranges: _Optional[_Iterable[_Union[MaterialRange, _Mapping]]] = ..., placement: _Optional[bytes] = ..., rest_q: _Optional[bytes] = ..., parent: _Optional[int] = ..., attachment_frame: _Optional[bytes] = ..., attachment_vertices: _Optional[_Iterable[int]] = ..., follows: _Optional[int] = ..., follow_frame: _Optional[bytes] = ..., shares_q_with: _Optional[int] = ..., eigenvalues: _Optional[_Union[Eigenvalues, _Mapping]] = ..., notes: _Optional[_Mapping[str, str]] = ..., exact_placement: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class MaterialRange(_message.Message):
     __slots__ = ("first_triangle", "material")
