@@ -16,6 +16,7 @@ async function pull(eigenvalues: number[], receiverError = ""): Promise<{ force:
     assert.ok(shape0);
     shape0.eigenvalues = eigenvalues;
     const triangle = {
+        origin: [0, 0, 0] as [number, number, number],
         restPositions: new Float32Array([0, 0, 0, 1, 0, 0, 0, 1, 0]),
         cornerVertices: new Uint32Array([0, 1, 2]),
         indices: new Uint32Array([0, 1, 2]),

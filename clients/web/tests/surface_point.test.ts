@@ -13,6 +13,7 @@ function attachedScene(): SceneModel {
     domain3.parent = 0;
     domain3.attachmentFrame = floats(...translation(0.9, 1.2, 0));
     const square = {
+        origin: [0, 0, 0] as [number, number, number],
         restPositions: new Float32Array([0, 0, 0, 1, 0, 0, 1, 1, 0, 0, 1, 0]),
         cornerVertices: new Uint32Array([0, 1, 2, 3]),
         indices: new Uint32Array([0, 1, 3, 1, 2, 3]),

@@ -1,6 +1,7 @@
 /** A point of the surface that moves with the scene. */
 
 import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
+import { restPosition } from "../scene/arrays";
 import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 
@@ -30,8 +31,9 @@ export function surfacePoint(
     for (let corner = 0; corner < 3; corner++) {
         const vertex = at(shape.cornerVertices, at(shape.indices, 3 * triangle + corner));
         const weight = at(barycentric, corner);
+        const position = restPosition(shape, vertex);
         for (let axis = 0; axis < 3; axis++) {
-            rest[axis] = at(rest, axis) + weight * at(shape.restPositions, 3 * vertex + axis);
+            rest[axis] = at(rest, axis) + weight * at(position, axis);
             for (let mode = 0; mode < rank; mode++) {
                 const place = axis * rank + mode;
                 modes[place] = at(modes, place) + weight * at(shape.modes ?? [], (3 * vertex + axis) * rank + mode);
@@ -67,8 +69,8 @@ function nearestCorner(model: SceneModel, domain: number, frame: Float32Array): 
     let nearest = 0;
     let smallest = Infinity;
     shape?.indices.forEach((corner, place) => {
-        const vertex = at(shape.cornerVertices, corner);
-        const offset = [0, 1, 2].map((axis) => at(shape.restPositions, 3 * vertex + axis) - at(frame, 4 * axis + 3));
+        const position = restPosition(shape, at(shape.cornerVertices, corner));
+        const offset = [0, 1, 2].map((axis) => at(position, axis) - at(frame, 4 * axis + 3));
         const distance = Math.hypot(...offset);
         if (distance < smallest) [nearest, smallest] = [place, distance];
     });

@@ -1,7 +1,7 @@
 /** Deforms all vertices of a scene on the GPU, once per state: a fragment per vertex writes a texture of positions. */
 
 import * as THREE from "three";
-import { TRANSFORM_SIZE } from "../scene/affine";
+import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
 import type { SceneArrays } from "../scene/arrays";
 import type { SceneDescription } from "../scene/description";
 import { at } from "../scene/numbers";
@@ -36,12 +36,15 @@ export class Deformer {
     private readonly target: THREE.WebGLRenderTarget;
     private readonly pass: FullscreenPass;
     private readonly textures: THREE.Texture[];
+    /** The point that the rest positions of each shape are relative to. */
+    private readonly shapeOrigins: Vec3[];
 
     constructor(
         private readonly renderer: THREE.WebGLRenderer,
         private readonly scene: SceneDescription,
         arrays: SceneArrays,
     ) {
+        this.shapeOrigins = arrays.shapes.map((shape) => shape.origin);
         const modes = packScene(scene, arrays);
         this.format = modes.format;
         this.packed = modes.shapes;
@@ -108,14 +111,23 @@ export class Deformer {
     /**
      * Deforms all vertices.
      *
-     * @param origin The render origin in scene units: it is subtracted in f64 before the transforms are rounded to f32.
+     * @param origin The render origin in scene units: it is subtracted in f64 before the transforms are rounded to f32. The
+     * translation A c + t belongs to rest positions relative to the origin c of their shape.
      */
     deform(state: SceneState, origin: readonly number[], display: DomainDisplay): void {
         for (let domain = 0; domain < this.scene.domains.length; domain++) {
             const place = 4 * TRANSFORM_TEXELS * domain;
+            const translation = applyToPoint(
+                state.transforms,
+                TRANSFORM_SIZE * domain,
+                this.shapeOrigins[at(this.shapeOf, domain)] ?? [0, 0, 0],
+            );
             for (let entry = 0; entry < TRANSFORM_SIZE; entry++) {
-                const shift = entry % 4 === 3 ? at(origin, entry >> 2) : 0;
-                this.transformValues[place + entry] = at(state.transforms, TRANSFORM_SIZE * domain + entry) - shift;
+                const axis = entry >> 2;
+                this.transformValues[place + entry] =
+                    entry % 4 === 3
+                        ? at(translation, axis) - at(origin, axis)
+                        : at(state.transforms, TRANSFORM_SIZE * domain + entry);
             }
             this.transformValues[place + TRANSFORM_SIZE] = display.hidden.has(domain) ? 0 : 1;
             this.transformValues[place + TRANSFORM_SIZE + 1] = display.highlighted === domain ? 1 : 0;

@@ -1,14 +1,17 @@
 /** The arrays of a scene: what a client needs to deform and draw it. */
 
+import type { Vec3 } from "./affine";
 import { ArrayKind, arrayHash, type SceneDescription } from "./description";
-import { toF32, toHex, toU32 } from "./numbers";
+import { at, toF32, toHex, toU32 } from "./numbers";
 
 export interface ShapeArrays {
     /** Three corners per triangle. */
     indices: Uint32Array;
     /** The vertex of each corner. */
     cornerVertices: Uint32Array;
-    /** x0: three numbers per vertex. */
+    /** c, the point that the rest positions are relative to, in the frame of the domain. */
+    origin: Vec3;
+    /** x0 - c: three numbers per vertex. */
     restPositions: Float32Array;
     /** Three numbers per corner. */
     normals: Float32Array;
@@ -16,6 +19,11 @@ export interface ShapeArrays {
     uvs: Float32Array | null;
     /** U: 3 vertices x rank, row-major; null if the shape is rigid. */
     modes: Float32Array | null;
+}
+
+/** x0 of a vertex in f64. */
+export function restPosition({ origin, restPositions }: ShapeArrays, vertex: number): Vec3 {
+    return [0, 1, 2].map((axis) => at(origin, axis) + at(restPositions, 3 * vertex + axis)) as Vec3;
 }
 
 export interface SceneArrays {
@@ -61,12 +69,16 @@ export function parseArrays(scene: SceneDescription, contents: ReadonlyMap<strin
         const uvs = arrayHash(shape, ArrayKind.UVS);
         const indices = toU32(read(ArrayKind.INDICES, 12 * shape.triangles));
         const cornerVertices = toU32(read(ArrayKind.CORNER_VERTICES, 4 * shape.corners));
+        const [x, y, z] = shape.origin;
+        const hasOrigin = x !== undefined && y !== undefined && z !== undefined;
+        const positions = hasOrigin ? ArrayKind.CENTERED_POSITIONS : ArrayKind.REST_POSITIONS;
         checkIndices(`shapes[${shape.shape}].indices`, indices, shape.corners);
         checkIndices(`shapes[${shape.shape}].corner_vertices`, cornerVertices, shape.vertices);
         return {
             indices,
             cornerVertices,
-            restPositions: toF32(read(ArrayKind.REST_POSITIONS, 12 * shape.vertices)),
+            origin: (hasOrigin ? [x, y, z] : [0, 0, 0]) as Vec3,
+            restPositions: toF32(read(positions, 12 * shape.vertices)),
             normals: toF32(read(ArrayKind.REST_NORMALS, 12 * shape.corners)),
             uvs: uvs ? toF32(read(ArrayKind.UVS, 8 * shape.corners)) : null,
             modes: shape.rank > 0 ? toF32(read(ArrayKind.MODES, 12 * shape.vertices * shape.rank)) : null,

@@ -1,7 +1,7 @@
 /** Bounds of the deformed scene from one sphere per domain, for the near plane and the shadow map. */
 
-import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "./affine";
-import type { ShapeArrays } from "./arrays";
+import { applyToPoint, norm, subtract, TRANSFORM_SIZE, type Vec3 } from "./affine";
+import { restPosition, type ShapeArrays } from "./arrays";
 import { at } from "./numbers";
 import { displacementBound, type PackedModes } from "./packed_modes";
 import type { SceneState } from "./state";
@@ -11,22 +11,29 @@ export interface Sphere {
     radius: number;
 }
 
-/** A sphere around the rest positions of a shape. */
-export function restSphere({ restPositions }: ShapeArrays): Sphere {
+/** A sphere around the rest positions of the vertices that triangles use. */
+export function restSphere(shape: ShapeArrays): Sphere {
+    const drawn = new Uint8Array(shape.restPositions.length / 3);
+    for (const corner of shape.indices) drawn[at(shape.cornerVertices, corner)] = 1;
     const min: Vec3 = [Infinity, Infinity, Infinity];
     const max: Vec3 = [-Infinity, -Infinity, -Infinity];
-    for (let i = 0; i < restPositions.length; i++) {
-        const axis = i % 3;
-        min[axis] = Math.min(at(min, axis), at(restPositions, i));
-        max[axis] = Math.max(at(max, axis), at(restPositions, i));
-    }
+    const forEachPosition = (visit: (position: Vec3) => void) => {
+        drawn.forEach((isDrawn, vertex) => {
+            if (isDrawn) visit(restPosition(shape, vertex));
+        });
+    };
+    forEachPosition((position) => {
+        for (let axis = 0; axis < 3; axis++) {
+            min[axis] = Math.min(at(min, axis), at(position, axis));
+            max[axis] = Math.max(at(max, axis), at(position, axis));
+        }
+    });
     const center: Vec3 = [(min[0] + max[0]) / 2, (min[1] + max[1]) / 2, (min[2] + max[2]) / 2];
-    let squared = 0;
-    for (let vertex = 0; vertex < restPositions.length / 3; vertex++) {
-        const [x, y, z] = [0, 1, 2].map((axis) => at(restPositions, 3 * vertex + axis) - at(center, axis)) as Vec3;
-        squared = Math.max(squared, x * x + y * y + z * z);
-    }
-    return { center, radius: Math.sqrt(squared) };
+    let radius = 0;
+    forEachPosition((position) => {
+        radius = Math.max(radius, norm(subtract(position, center)));
+    });
+    return { center, radius };
 }
 
 /** A sphere around a deformed domain. */

@@ -6,7 +6,7 @@
  */
 
 import { applyToPoint, IDENTITY, multiply, product, TRANSFORM_SIZE, type Vec3 } from "./affine";
-import type { SceneArrays } from "./arrays";
+import { restPosition, type SceneArrays } from "./arrays";
 import { rankOf, type SceneDescription } from "./description";
 import { at, toF32 } from "./numbers";
 import type { SceneState, StateLayout } from "./state";
@@ -38,7 +38,7 @@ export class Kinematics {
                 domain: domain.domain,
                 parent,
                 frame: toF32(attachmentFrame, "attachment_frame"),
-                rest: vertices.map((vertex) => [0, 1, 2].map((c) => at(shape.restPositions, 3 * vertex + c)) as Vec3),
+                rest: vertices.map((vertex) => restPosition(shape, vertex)),
                 modes: vertices.map(
                     (vertex) => shape.modes?.slice(3 * vertex * rank, 3 * (vertex + 1) * rank) ?? new Float32Array(),
                 ),

@@ -85,6 +85,13 @@ export class SceneState {
         for (const domain of scene.domains) {
             const placement = domain.placement.length > 0 ? toF32(domain.placement, "placement") : IDENTITY;
             this.rootTransforms.set(placement, TRANSFORM_SIZE * domain.domain);
+            // A placement that is far from the scene's origin also has f64 numbers.
+            if (domain.exactPlacement.length === TRANSFORM_SIZE) {
+                for (let axis = 0; axis < 3; axis++) {
+                    this.rootTransforms[TRANSFORM_SIZE * domain.domain + 4 * axis + 3] = 0;
+                    this.rootOrigins[3 * domain.domain + axis] = at(domain.exactPlacement, 4 * axis + 3);
+                }
+            }
             if (domain.restQ.length > 0 && layout.owner[domain.domain] === domain.domain) {
                 this.q.set(toF32(domain.restQ, "rest_q"), at(layout.firstCoordinate, domain.domain));
             }
