@@ -75,8 +75,12 @@ __device__ inline float3 normalize(const double3& v) {
     return make_float3(x * inverse_length, y * inverse_length, z * inverse_length);
 }
 
+__device__ inline double3 multiply(const Mat3d& m, const double3& v) {
+    return make_double3(dot(m.row0, v), dot(m.row1, v), dot(m.row2, v));
+}
+
 __device__ inline float3 transform_direction(const Mat3d& m, const double3& v) {
-    return normalize(make_double3(dot(m.row0, v), dot(m.row1, v), dot(m.row2, v)));
+    return normalize(multiply(m, v));
 }
 
 #ifdef SHEAR
@@ -86,12 +90,18 @@ __device__ inline double3 signed_cross(const double3& v, const double3& w, doubl
                         sign * minor2x2(v.x, v.y, w.x, w.y));
 }
 
-// The inverse transpose is the cofactor matrix divided by the determinant. After normalization, only the sign of the
-// determinant matters.
+// The cofactors of A times `sign`.
+__device__ inline Mat3d signed_cofactors(const Mat3d& m, double sign) {
+    return {signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign), signed_cross(m.row0, m.row1, sign)};
+}
+
+// The inverse transpose times a positive number: the cofactors times the sign of the determinant.
+__device__ inline Mat3d inverse_transpose(const Mat3d& m) {
+    return signed_cofactors(m, determinant_sign(m));
+}
+
 __device__ inline float3 transform_normal(const Mat3d& m, const double3& normal) {
-    const double sign = determinant_sign(m);
-    return transform_direction({signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign),
-                                signed_cross(m.row0, m.row1, sign)}, normal);
+    return transform_direction(inverse_transpose(m), normal);
 }
 #else
 __device__ inline float3 transform_normal(const Mat3d& m, const double3& normal) {

@@ -40,6 +40,9 @@
 // 2^-18: the area sum of a group has a defined direction if it is longer than this fraction of B (`rounding_scale`
 // below), which is proportional to the bound of its rounding error. The twin has the derivation.
 constexpr double RESOLUTION = 1.0 / 262144.0;
+// 2^-20: a unit normal is lost if the cofactors of A map it to a vector of at most this fraction of their norm, as in the
+// twin, which also says how exact normals are then defined.
+constexpr double FLATTENED = 1.0 / 1048576.0;
 // Two unit vectors are opposite if the length of their sum is below 1e-5 (1e-10 is its square), as in the twin.
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;
 
@@ -105,9 +108,23 @@ __device__ Area sum_areas(const unsigned* ring, const unsigned* end, const float
     return {sum, rounding_scale};
 }
 
-// The rotation of the surface at a packed corner.
+// Whether the cofactors of A lose this unit normal. Without SHEAR, A keeps all angles.
+__device__ bool is_flattened(const Mat3d& linear, const double3& normal) {
+#ifdef SHEAR
+    const Mat3d cofactors = signed_cofactors(linear, 1.0);
+    const double3 transformed = multiply(cofactors, normal);
+    const double squared_norm =
+        dot(cofactors.row0, cofactors.row0) + dot(cofactors.row1, cofactors.row1) + dot(cofactors.row2, cofactors.row2);
+    return dot(transformed, transformed) <= FLATTENED * FLATTENED * squared_norm;
+#else
+    return false;
+#endif
+}
+
+// The rotation of the surface at a packed corner with this normal at rest, which T transforms to `rigid_normal`.
 __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const NormalSlot& slot, const Mat3d& linear,
-                                                unsigned corner) {
+                                                unsigned corner, const double3& rest_normal,
+                                                const float3& rigid_normal) {
     ShortestArc rotation = {{0.0f, 0.0f, 0.0f}, {0.0f, 0.0f, 0.0f}, false};
     if (slot.first_corner_group == NO_GROUPS) {
         return rotation;
@@ -135,7 +152,11 @@ __device__ ShortestArc compute_surface_rotation(const NormalsArgs& args, const N
     // by the factor of the determinant, so the directions differ by its sign.
     const double sign = determinant_sign(linear);
     rotation.deformed_normal = normalize(make_double3(sign * sum.x, sign * sum.y, sign * sum.z));
-    rotation.rigid_normal = transform_normal(linear, normal);
+    if (is_flattened(linear, normal)) {
+        rotation.rigid_normal = multiply(rigid_normal, dot(rest_normal, normal) < 0.0 ? -1.0f : 1.0f);
+    } else {
+        rotation.rigid_normal = transform_normal(linear, normal);
+    }
     return rotation;
 }
 
@@ -178,11 +199,12 @@ extern "C" __global__ void __launch_bounds__(BLOCK) normals(const __grid_constan
     if (corner < args.corner_count) {
         const NormalSlot slot = args.slots[domain];
         const Mat3d linear = load_linear_part(transforms_of(args), domain);
-        const ShortestArc rotation = compute_surface_rotation(args, slot, linear, corner);
-        const float* rest_normal = args.rest_normals + slot.first_normal + (corner - slot.first_corner);
+        const float* rest_components = args.rest_normals + slot.first_normal + (corner - slot.first_corner);
         const size_t axis_stride = args.rest_corner_count;
-        float3 normal = transform_normal(linear, make_double3(__ldg(rest_normal), __ldg(rest_normal + axis_stride),
-                                                              __ldg(rest_normal + 2 * axis_stride)));
+        const double3 rest_normal = make_double3(__ldg(rest_components), __ldg(rest_components + axis_stride),
+                                                 __ldg(rest_components + 2 * axis_stride));
+        float3 normal = transform_normal(linear, rest_normal);
+        const ShortestArc rotation = compute_surface_rotation(args, slot, linear, corner, rest_normal, normal);
         if (rotation.is_defined) {
             normal = normalize(rotate(rotation, normal));
         }

@@ -76,12 +76,6 @@ __device__ __forceinline__ Mat3f to_scaled_mat3f(const Mat3d& m) {
             make_float3(m.row1.x * scale, m.row1.y * scale, m.row1.z * scale),
             make_float3(m.row2.x * scale, m.row2.y * scale, m.row2.z * scale)};
 }
-
-// The cofactor matrix times the sign of the determinant: the inverse transpose times a positive number.
-__device__ __forceinline__ Mat3d signed_cofactors(const Mat3d& m) {
-    const double sign = determinant_sign(m);
-    return {signed_cross(m.row1, m.row2, sign), signed_cross(m.row2, m.row0, sign), signed_cross(m.row0, m.row1, sign)};
-}
 #endif
 
 // Repeats the transformation in f64 for the corners of a lane in the bit mask `imprecise_corners`. The other corners
@@ -190,7 +184,7 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
 #endif
 #ifdef SHEAR
     write_rigid_normals(args, staging, slice, rest_normals,
-                        to_scaled_mat3f(signed_cofactors(load_linear_part(transforms_of(args), slice.domain))), first_corner);
+                        to_scaled_mat3f(inverse_transpose(load_linear_part(transforms_of(args), slice.domain))), first_corner);
 #else
     write_rigid_normals(args, staging, slice, rest_normals, load_scaled_linear_part(transforms_of(args), slice.domain),
                         first_corner);

@@ -1,10 +1,10 @@
-//! Normals and tangents under shears and mirrors, and of triangles without area.
+//! Normals and tangents under shears, mirrors and singular transforms, and of triangles without area.
 
 use std::sync::Arc;
 
 use modalcast_compute::reference::{rigid_normals, rigid_tangents};
 use modalcast_model::deform::Deformer;
-use modalcast_model::domain::{Corners, Mesh, Shape, Transform};
+use modalcast_model::domain::{Corners, Mesh, Modes, Shape, Transform};
 use modalcast_model::scene::{DeformationSettings, NormalMethod, Scene, SceneState};
 
 use super::{assert_within_bound, run_step, scene_of_shapes};
@@ -57,6 +57,47 @@ pub(crate) fn check_shears_and_mirrors<D: Deformer>(create_deformer: impl Fn(&Ar
     state.transforms[0] = Transform::IDENTITY;
     let (normal_error, tangent_error) = direction_errors(&state);
     assert!(normal_error > 0.1 && tangent_error > 0.1);
+}
+
+/// A T that maps space to a plane gives the normal of this plane, also where it folds the rest surface to a line. The
+/// surface is a fan in the plane x = 0 with three normals at rest. It tilts about z, so that it has an area in the image.
+pub(crate) fn check_singular_transforms<D: Deformer>(create_deformer: impl Fn(&Arc<Scene>) -> D) {
+    let positions = [[0.0; 3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]];
+    let uvs: Vec<[f32; 2]> = positions.iter().map(|[_, y, z]| [*y, *z]).collect();
+    let triangles = vec![[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 1]];
+    // u = (y, 0, 0) q.
+    let column: Vec<f32> = positions.iter().flat_map(|[_, y, _]| [*y, 0.0, 0.0]).collect();
+    let rest_normals = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.8, 0.6, 0.0]];
+    let shapes = rest_normals.map(|normal| {
+        let mesh = Mesh::from_indexed(positions.to_vec(), vec![normal; 5], uvs.clone(), triangles.clone());
+        let modes = Modes::from_columns(15, 1, column.clone()).expect("expected valid modes");
+        Shape::new(mesh.expect("expected a valid mesh"), modes).expect("expected a valid shape")
+    });
+    let deformation = DeformationSettings { normals: NormalMethod::Exact, ..DeformationSettings::default() };
+    let scene = scene_of_shapes(shapes.to_vec(), 1, deformation, true);
+    let mut deformer = create_deformer(&scene);
+    // The image is the plane with the normal (0, 0.8, 0.6). Its determinant is 0, without a rounding error.
+    let singular = Transform([25.0, 0.0, 0.0, 1.0, 0.0, 9.0, -12.0, 2.0, 0.0, -12.0, 16.0, 3.0]);
+    for tilt in [0.5, -0.5_f32] {
+        let mut state = SceneState::rest(&scene);
+        state.q.iter_mut().for_each(|q| *q = tilt);
+        state.transforms.iter_mut().for_each(|transform| *transform = singular);
+        let surface = run_step(&mut deformer, &state).surface;
+        let exact_positions = modalcast_compute::reference::deform(&scene, &state);
+        let by_reference = modalcast_compute::reference::exact_normals(&scene, &state, &exact_positions);
+        for (corner, normal) in surface.normals.as_chunks::<3>().0.iter().enumerate() {
+            // The area of the deformed fan before T has the direction (1, -q, 0).
+            let side = f64::from(-tilt.signum()) * if (5..10).contains(&corner) { -1.0 } else { 1.0 };
+            let expected = [0.0, 0.8 * side, 0.6 * side];
+            assert!(max_abs_error(normal, &expected) < 1e-5, "tilt {tilt}, corner {corner}: {normal:?}");
+            assert!(max_abs_error(normal, &by_reference[corner]) < 1e-5, "{:?}", by_reference[corner]);
+        }
+        assert!(are_unit_vectors(&surface.tangents, 4));
+        for (tangent, normal) in surface.tangents.chunks_exact(4).zip(surface.normals.chunks_exact(3)) {
+            let product: f32 = tangent.iter().zip(normal).map(|(tangent, normal)| tangent * normal).sum();
+            assert!(product.abs() < 1e-5, "{tangent:?} is not orthogonal to {normal:?}");
+        }
+    }
 }
 
 /// Position of a vertex.

@@ -55,6 +55,12 @@ fn gpu_shears_and_mirrors_equal_the_reference() {
 
 #[test]
 #[ignore = "needs an NVIDIA GPU"]
+fn gpu_singular_transforms_have_the_normal_of_their_plane() {
+    surfaces::check_singular_transforms(cuda_deformer);
+}
+
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
 fn gpu_zero_area_and_missing_uvs_give_valid_directions() {
     surfaces::check_zero_area_and_missing_uvs(cuda_deformer);
 }

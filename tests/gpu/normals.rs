@@ -202,6 +202,22 @@ fn gpu_exact_normals_of_creases_equal_the_reference() {
     assert_equals_reference("prisms", &scene, &scenes::random_state(&scene, 11), &mut deformer);
 }
 
+/// Prisms that T flattens along their axis, exactly or up to rounding, so that the cofactors of T lose the normals of the
+/// sides. Modes tilt the sides.
+#[test]
+#[ignore = "needs an NVIDIA GPU"]
+fn gpu_exact_normals_of_flattened_prisms_equal_the_reference() {
+    let mut random = Random(12);
+    let shapes = vec![creased_prism(&mut random, 6, 3), creased_prism(&mut random, 300, 4)];
+    let options = RandomSceneOptions { instances: 2, normal_maps: false, rigid_transforms: false };
+    let scene = scene_with_exact_normals(shapes, options);
+    let mut state = scenes::random_state(&scene, 13);
+    for (transform, thickness) in state.transforms.iter_mut().zip([0.0, 0.0, 1e-9, -1e-9]) {
+        [1, 5, 9].into_iter().for_each(|entry| transform.0[entry] *= thickness);
+    }
+    assert_equals_reference("flattened prisms", &scene, &state, &mut cuda_deformer(&scene));
+}
+
 /// Checks a shape with modes at q = 0, and a shape without modes.
 #[test]
 #[ignore = "needs an NVIDIA GPU"]

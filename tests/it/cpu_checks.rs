@@ -53,6 +53,11 @@ fn shears_and_mirrors_equal_the_reference() {
 }
 
 #[test]
+fn singular_transforms_have_the_normal_of_their_plane() {
+    surfaces::check_singular_transforms(cpu_deformer);
+}
+
+#[test]
 fn zero_area_and_missing_uvs_give_valid_directions() {
     surfaces::check_zero_area_and_missing_uvs(cpu_deformer);
 }

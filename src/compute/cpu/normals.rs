@@ -17,6 +17,9 @@ use modalcast_model::scene::{Scene, SceneState};
 /// 2^-18, as in the twin: the area of a group must exceed this fraction of its rounding scale (the B of the twin).
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
+/// 2^-20, as in the twin: a unit normal is lost if the cofactors of A map it to at most this fraction of their norm.
+const FLATTENED: f64 = 1.0 / 1_048_576.0;
+
 /// As in the twin: squared length below which the sum of two unit vectors counts as zero.
 const MIN_BISECTOR_SQUARED_LENGTH: f64 = 1e-10;
 
@@ -48,13 +51,12 @@ pub(super) fn compute_normals(scene: &Scene, state: &SceneState, tiles: &[Domain
 fn rotate_to_surface(surface: &DeformedDomain, first_corner: usize, normals: &mut [f32], tangents: &mut [f32]) {
     let Some(smoothing) = surface.smoothing else { return };
     let mut tangents = tangents.chunks_exact_mut(4);
-    for (group, normal) in smoothing.corner_groups()[first_corner..].iter().zip(normals.chunks_exact_mut(3)) {
+    for (corner, normal) in (first_corner..).zip(normals.chunks_exact_mut(3)) {
         let tangent = tangents.next();
-        let Some(surface_rotation) = surface.surface_rotation(smoothing, *group as usize) else { continue };
-        let rotated_normal = surface_rotation
-            .rotate(to_vector(normal))
-            .try_normalize(0.0)
-            .unwrap_or(surface_rotation.deformed_direction);
+        let rigid_normal = to_vector(normal);
+        let Some(surface_rotation) = surface.surface_rotation(smoothing, corner, rigid_normal) else { continue };
+        let rotated_normal =
+            surface_rotation.rotate(rigid_normal).try_normalize(0.0).unwrap_or(surface_rotation.deformed_direction);
         normal.copy_from_slice(rotated_normal.cast::<f32>().as_slice());
         if let Some(tangent) = tangent.filter(|tangent| tangent[3] != 0.0) {
             let rotated_tangent = orthogonalize(surface_rotation.rotate(to_vector(tangent)), rotated_normal);
@@ -67,31 +69,56 @@ fn rotate_to_surface(surface: &DeformedDomain, first_corner: usize, normals: &mu
 struct DeformedDomain<'a> {
     /// `None` for a shape without modes, whose normals are rigid.
     smoothing: Option<&'a SmoothingGroups>,
+    /// Per corner.
+    rest_normals: &'a [[f32; 3]],
     /// Three f32 per vertex of the domain.
     positions: &'a [f32],
     /// Transforms area vectors from rest to world: the cofactors of A, the linear part of T.
     area_transform: Matrix3<f64>,
+    /// Sign of the determinant of A.
+    determinant_sign: f64,
 }
 
 impl<'a> DeformedDomain<'a> {
     fn new(scene: &'a Scene, state: &SceneState, domain: usize, positions: &'a [f32]) -> Self {
         let layout = scene.layout.domains[domain];
+        let shape = scene.shape_of(domain);
+        let linear = state.composed_transform(scene, domain).linear();
         Self {
-            smoothing: scene.shape_of(domain).smoothing(),
+            smoothing: shape.smoothing(),
+            rest_normals: &shape.mesh.corners().normals,
             positions: &positions[3 * layout.first_vertex..][..3 * layout.vertices],
-            area_transform: cofactors(&state.composed_transform(scene, domain).linear()),
+            area_transform: cofactors(&linear),
+            determinant_sign: linear.determinant().signum(),
         }
     }
 
-    /// The rotation of the surface around a group; `None` where it cannot be determined.
-    fn surface_rotation(&self, smoothing: &SmoothingGroups, group: usize) -> Option<ShortestArc> {
+    /// The rotation of the surface around a corner, whose rigid normal is given; `None` where it cannot be determined.
+    fn surface_rotation(
+        &self,
+        smoothing: &SmoothingGroups,
+        corner: usize,
+        rigid_normal: Vector3<f64>,
+    ) -> Option<ShortestArc> {
+        let group = smoothing.corner_groups()[corner] as usize;
+        let group_normal = to_vector(&smoothing.normals()[group]);
         let (area_sum, rounding_scale) = self.sum_areas(smoothing.ring(group));
         let is_resolved = area_sum.norm() > RESOLUTION * rounding_scale;
-        let rest_area = self.area_transform * Vector3::from(smoothing.normals()[group]).cast();
+        if !is_resolved || group_normal == Vector3::zeros() {
+            return None;
+        }
+        let rest_area = self.area_transform * group_normal;
+        if rest_area.norm() <= FLATTENED * self.area_transform.norm() {
+            // The rest direction is lost. The corner's own normal turns to the surface, on its side.
+            let is_opposite = to_vector(&self.rest_normals[corner]).dot(&group_normal) < 0.0;
+            return Some(ShortestArc {
+                rigid_direction: if is_opposite { -rigid_normal } else { rigid_normal },
+                deformed_direction: area_sum.normalize() * self.determinant_sign,
+            });
+        }
         // Scale first, because the squares of tiny cofactors may underflow.
-        let max_component = rest_area.amax();
-        (is_resolved && max_component > 0.0).then(|| ShortestArc {
-            rigid_direction: (rest_area / max_component).normalize(),
+        Some(ShortestArc {
+            rigid_direction: (rest_area / rest_area.amax()).normalize(),
             deformed_direction: area_sum.normalize(),
         })
     }

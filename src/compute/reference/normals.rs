@@ -35,11 +35,18 @@
 //! could cause is not applied. A domain of one meter at 10^7 meters thus has rigid normals, unless the scene's origin
 //! is near it.
 //!
+//! # Flattened surfaces
+//! A singular A flattens a surface to a plane, and the parts of it that are perpendicular to this plane to lines. Their
+//! rest sum is then lost, because the cofactors of A map it to zero or to rounding noise: at most [`FLATTENED`] times
+//! the norm of the cofactors. If the current sum of such a group is resolved, U q has tilted it, and no rotation from
+//! rest is needed to know its normal: it is the direction of the current sum, on the side of the surface on which the
+//! rest normal is.
+//!
 //! Close to half a turn the axis of the smallest rotation is ill-conditioned. Rest normals that differ from the
 //! geometric ones by an angle d may be off by 2 d there. At half a turn, the component perpendicular to the normal is
 //! not rotated.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 
 use super::rigid_normals::{cofactors, rigid_normals, rigid_tangents};
 use modalcast_model::domain::Mesh;
@@ -48,13 +55,18 @@ use modalcast_model::scene::{Scene, SceneState};
 /// 2^-18: the fraction of B that an area must exceed.
 const RESOLUTION: f64 = 1.0 / 262_144.0;
 
+/// 2^-20: a unit normal is lost if the cofactors of A map it to a vector of at most this fraction of their norm. The
+/// rounding of rest normals to f32 alone gives up to 2^-24.
+const FLATTENED: f64 = 1.0 / 1_048_576.0;
+
 /// Two unit vectors are opposite if the squared length of their sum is below this: half a turn, within 1e-5 rad.
 const MIN_BISECTOR_SQUARED_LENGTH: f64 = 1e-10;
 
 /// World unit normals, one per corner, of a surface at `positions` (the result of `deform` for the same state).
 pub fn exact_normals(scene: &Scene, state: &SceneState, positions: &[[f64; 3]]) -> Vec<[f64; 3]> {
-    let mut normals = rigid_normals(scene, state);
-    for_each_rotated_corner(scene, state, positions, |corner, rotation| {
+    let rigid_normals = rigid_normals(scene, state);
+    let mut normals = rigid_normals.clone();
+    for_each_rotated_corner(scene, state, positions, &rigid_normals, |corner, rotation| {
         normals[corner] = rotate_normal(rotation, normals[corner]).into()
     });
     normals
@@ -68,7 +80,7 @@ pub fn exact_tangents(scene: &Scene, state: &SceneState, positions: &[[f64; 3]])
         return tangents;
     }
     let rigid_normals = rigid_normals(scene, state);
-    for_each_rotated_corner(scene, state, positions, |corner, rotation| {
+    for_each_rotated_corner(scene, state, positions, &rigid_normals, |corner, rotation| {
         let [x, y, z, sign] = tangents[corner];
         if sign != 0.0 {
             let tangent =
@@ -118,6 +130,7 @@ fn for_each_rotated_corner(
     scene: &Scene,
     state: &SceneState,
     positions: &[[f64; 3]],
+    rigid_normals: &[[f64; 3]],
     mut process: impl FnMut(usize, &ShortestArc),
 ) {
     for (domain, layout) in scene.layout.domains.iter().enumerate() {
@@ -128,7 +141,8 @@ fn for_each_rotated_corner(
         });
         let current_areas =
             sum_areas(&shape.mesh, smoothing.corner_groups(), |vertex| positions[layout.first_vertex + vertex]);
-        let area_transform = cofactors(&state.composed_transform(scene, domain).linear());
+        let linear = state.composed_transform(scene, domain).linear();
+        let (area_transform, determinant_sign) = (cofactors(&linear), linear.determinant().signum());
         for (corner, group) in smoothing.corner_groups().iter().enumerate() {
             let group = *group as usize;
             // The geometric normal of a group without area at rest is zero.
@@ -137,11 +151,26 @@ fn for_each_rotated_corner(
             if !has_normal || !is_resolved {
                 continue;
             }
-            let Some(rest_direction) = normalize_scaled(area_transform * rest_areas[group].sum) else { continue };
-            let Some(current_direction) = normalize_scaled(current_areas[group].sum) else { continue };
+            let Some(mut current_direction) = normalize_scaled(current_areas[group].sum) else { continue };
+            let group_normal = Vector3::from(smoothing.normals()[group]).cast::<f64>();
+            let rest_direction = if is_flattened(&area_transform, group_normal) {
+                // The corner's own normal turns to the surface.
+                current_direction *= determinant_sign;
+                let rest_normal = Vector3::from(shape.mesh.corners().normals[corner]).cast::<f64>();
+                let side = if rest_normal.dot(&group_normal) < 0.0 { -1.0 } else { 1.0 };
+                Some(Vector3::from(rigid_normals[layout.first_corner + corner]) * side)
+            } else {
+                normalize_scaled(area_transform * rest_areas[group].sum)
+            };
+            let Some(rest_direction) = rest_direction else { continue };
             process(layout.first_corner + corner, &ShortestArc { rest_direction, current_direction });
         }
     }
+}
+
+/// Whether the cofactors of A lose this unit normal ([`FLATTENED`]).
+fn is_flattened(cofactors: &Matrix3<f64>, normal: Vector3<f64>) -> bool {
+    (cofactors * normal).norm() <= FLATTENED * cofactors.norm()
 }
 
 /// The sum of the area vectors around a group, and its rounding scale B.

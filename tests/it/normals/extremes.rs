@@ -3,7 +3,7 @@
 
 use modalcast_compute::reference;
 use modalcast_model::scene::Scene;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::fixtures::{
     angle_degrees, create_scene, create_state, deform_on_cpu, max_angle_degrees, reference_normals_and_tangents,
@@ -75,6 +75,30 @@ fn collapsed_sheet_keeps_its_rigid_normals() {
     assert!(
         max_angle_degrees(&deform_on_cpu(&narrow_scene, &uniform_q_state(&narrow_scene, 1.0)).normals, &normals) < 0.1
     );
+}
+
+/// A tube that T flattens along its axis is a circle. A mode opens it to a cone, whose flat picture has a normal, although
+/// T maps all rest normals to zero. Exactly singular transforms, and one that is singular up to rounding on each side.
+#[test]
+fn flattened_tube_has_the_normals_of_its_cone() {
+    let scene = create_scene(vec![shape_with_mode(tube(24, 5, 0.0), |[x, y, z]| [x * y, 0.0, z * y])]);
+    let rotation = Rotation3::from_euler_angles(0.3, -1.1, 2.0).into_inner();
+    for thickness in [0.0, 1e-9, -1e-9] {
+        let linear = rotation * Matrix3::from_diagonal(&Vector3::new(1.0, thickness, 1.0));
+        let state = create_state(&scene, 0.5, linear, [0.0; 3]);
+        let (normals, tangents) = reference_normals_and_tangents(&scene, &state);
+        // The radius is 1 + y / 2, so that the normal has the slope -1/2 along y, of which only the sign remains.
+        let determinant_sign = state.composed_transform(&scene, 0).linear().determinant().signum();
+        let expected: [f64; 3] = (rotation * Vector3::new(0.0, -determinant_sign, 0.0)).into();
+        for (normal, [tangent @ .., _]) in normals.iter().zip(&tangents) {
+            assert!(angle_degrees(*normal, expected) < 0.01, "{thickness}: {normal:?} {expected:?}");
+            assert!(Vector3::from(*normal).dot(&Vector3::from(*tangent)).abs() < 1e-6, "{tangent:?}");
+        }
+        let surface = deform_on_cpu(&scene, &state);
+        assert!(max_angle_degrees(&surface.normals, &normals) < MAX_ANGLE_DEGREES, "{thickness}");
+        let rigid_normals = reference::rigid_normals(&scene, &state);
+        assert!(rigid_normals.iter().all(|normal| angle_degrees(*normal, expected) > 30.0), "negative control");
+    }
 }
 
 /// Corners without triangles keep their rest normals.
