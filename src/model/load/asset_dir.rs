@@ -22,6 +22,13 @@ pub(super) const MAX_TEXT_BYTES: u64 = 64 << 20;
 
 /// The largest number of directory entries that are read.
 const MAX_ENTRIES: usize = 10_000;
+/// The largest length of a path in a model file in bytes. No file has a longer path.
+const MAX_REFERENCE_BYTES: usize = 4096;
+/// Reasons of a remark on a path in a model file.
+const MISSING: &str = "does not exist";
+const OUTSIDE: &str = "is outside of the folder of the scene";
+/// The largest number of last components of a path in a model file by which its file is searched.
+const MAX_SEARCHED_NAMES: usize = 8;
 
 /// A folder whose files a loader may read. With a `root`, every path must stay inside the root after symbolic links are
 /// resolved. Without a `root`, any path is allowed.
@@ -30,6 +37,8 @@ pub(super) struct AssetDir {
     /// The folder to which paths are relative.
     base: PathBuf,
     root: Option<PathBuf>,
+    /// The folder of the scene: paths in model files cannot leave it. `None` before a scene is chosen: `base` is used.
+    scene_folder: Option<PathBuf>,
     /// Whether a file that another file refers to must exist.
     is_strict: bool,
     /// The memory of the scene that is loaded. Clones of the folder share it.
@@ -39,6 +48,24 @@ pub(super) struct AssetDir {
     /// The hashes of all files in the root, if the files were uploaded. Files that are read whole are verified. The start
     /// of a file, which only decides whether the file is used, is not.
     hashes: Option<Arc<FileHashes>>,
+}
+
+/// The file to which a path in a model file refers.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum ReferencedFile {
+    /// The path of a file.
+    Exact(String),
+    /// No file has the path, for this reason, but another file has a similar path.
+    Similar { path: String, reason: &'static str },
+    /// No file has the path, for this reason, or a similar one.
+    Missing { reason: &'static str },
+}
+
+/// A normalized path in a model file: the parents that it starts with, then names of folders and the file.
+#[derive(Debug, Clone, Copy)]
+struct ReferencePath<'a> {
+    parents: usize,
+    names: &'a [&'a str],
 }
 
 /// The bytes of a file. Their memory is reserved until this is dropped.
@@ -76,7 +103,15 @@ impl AssetDir {
     }
 
     fn new(base: &Path, root: Option<PathBuf>, memory: Arc<MemoryReservation>) -> Self {
-        Self { base: base.to_path_buf(), root, is_strict: false, memory, listings: Arc::default(), hashes: None }
+        Self {
+            base: base.to_path_buf(),
+            root,
+            scene_folder: None,
+            is_strict: false,
+            memory,
+            listings: Arc::default(),
+            hashes: None,
+        }
     }
 
     /// The same folder, whose files must have these hashes.
@@ -114,7 +149,7 @@ impl AssetDir {
         self.memory.reserve_temporary(object, bytes)
     }
 
-    /// The same folder. [`Self::has_referenced_file`] fails for files that do not exist.
+    /// The same folder. [`Self::find_referenced`] fails for files that do not exist.
     pub(super) fn strict(&self) -> Self {
         Self { is_strict: true, ..self.clone() }
     }
@@ -124,31 +159,125 @@ impl AssetDir {
         self.is_strict
     }
 
-    /// Whether a file exists that another file refers to. If it does not, the loader uses a stand-in and adds a remark.
+    /// The path of the file to which a model file refers as `reference`: an image or a material library. All formats,
+    /// programs and uploads share this rule:
+    ///
+    /// - A path relative to this folder that stays in the folder of the scene is read. The other paths are absolute, with
+    ///   a drive or a scheme, or lead to a parent of the folder of the scene: nothing outside is read.
+    /// - If no such file exists, a file of this path in other letter case is read, with a remark, or else a file in or
+    ///   below this folder whose path is the longest end of `reference`: `C:\work\maps\a.png` is `maps/a.png` or `a.png`.
+    /// - Otherwise, the result is `None`: the loader uses the stand-in that the remark names.
+    ///
+    /// A remark begins with `subject`.
     ///
     /// # Errors
-    /// `Invalid` for a path that leaves the root and, in strict mode, for a file that does not exist.
-    pub(super) fn has_referenced_file(&self, relative: &str) -> Result<bool> {
-        match self.kind(relative)? {
-            None if self.is_strict => Err(invalid(field_of(relative), "an existing file", "none (strict mode)")),
-            kind => Ok(kind.is_some()),
+    /// In strict mode, `Invalid` for a file that does not exist or has another path.
+    pub(super) fn find_referenced(
+        &self,
+        reference: &str,
+        subject: &str,
+        stand_in: &str,
+        remarks: &mut Vec<String>,
+    ) -> Result<Option<String>> {
+        let (path, reason) = match self.locate(reference) {
+            ReferencedFile::Exact(path) => return Ok(Some(path)),
+            ReferencedFile::Similar { path, reason } => (Some(path), reason),
+            ReferencedFile::Missing { reason } => (None, reason),
+        };
+        if self.is_strict {
+            let (expected, given) = match reason {
+                OUTSIDE => ("a path in the folder of the scene", "a path outside of it"),
+                _ => ("an existing file", path.as_deref().unwrap_or("none")),
+            };
+            return Err(invalid(field_of(reference), expected, format!("{given} (strict mode)")));
+        }
+        let treatment = path.as_ref().map_or_else(|| stand_in.to_owned(), |path| format!("'{path}' is read"));
+        remarks.push(format!("{subject} {reason}: {treatment}"));
+        Ok(path)
+    }
+
+    /// As [`Self::find_referenced`], for an image. `None` also for an image that is not drawn because of its format.
+    ///
+    /// # Errors
+    /// As for [`Self::find_referenced`] and [`Self::read_start`]; in strict mode, also for other formats than PNG, JPEG
+    /// and WebP.
+    pub(super) fn find_image(
+        &self,
+        reference: &str,
+        subject: &str,
+        stand_in: &str,
+        remarks: &mut Vec<String>,
+    ) -> Result<Option<String>> {
+        let Some(path) = self.find_referenced(reference, subject, stand_in, remarks)? else { return Ok(None) };
+        let start = self.read_start(&path, Texture::SIGNATURE_BYTES as u64)?;
+        let unsupported = self.unsupported_image(&path, &start)?;
+        remarks.extend(unsupported.map(|reason| format!("{subject} {reason}: {stand_in}")));
+        Ok(unsupported.is_none().then_some(path))
+    }
+
+    /// Finds the file to which a model file refers by the rule of [`Self::find_referenced`], without access to files
+    /// outside of the folder of the scene.
+    pub(super) fn locate(&self, reference: &str) -> ReferencedFile {
+        if reference.len() > MAX_REFERENCE_BYTES {
+            return ReferencedFile::Missing { reason: MISSING };
+        }
+        let text = reference.replace('\\', "/");
+        let (mut parents, mut names) = (0, Vec::new());
+        for name in text.split('/').filter(|name| !matches!(*name, "" | ".")) {
+            match name {
+                ".." if names.pop().is_none() => parents += 1,
+                ".." => {}
+                name => names.push(name),
+            }
+        }
+        let path = ReferencePath { parents, names: &names };
+        let is_inside = !text.starts_with('/') && self.is_in_scene_folder(parents);
+        if is_inside && self.has_file(&path.to_string()) {
+            return ReferencedFile::Exact(path.to_string());
+        }
+        // `C:/`, `file:///` and `https://`.
+        let has_prefix = text.split('/').next().is_some_and(|name| name.contains(':'));
+        let reason = if is_inside && !has_prefix { MISSING } else { OUTSIDE };
+        let first_start = names.len().saturating_sub(MAX_SEARCHED_NAMES);
+        let ends = (first_start..names.len()).map(|start| ReferencePath { parents: 0, names: &names[start..] });
+        let mut searches = is_inside.then_some(path).into_iter().chain(ends);
+        match searches.find_map(|path| self.find_ignoring_case(path)) {
+            Some(path) => ReferencedFile::Similar { path, reason },
+            None => ReferencedFile::Missing { reason },
         }
     }
 
-    /// The reason why the image that another file refers to is not drawn, worded as the end of a remark. `None` for a
-    /// PNG, JPEG or WebP image.
-    ///
-    /// # Errors
-    /// As for [`Self::has_referenced_file`] and [`Self::read_start`]; in strict mode, also for other formats.
-    pub(super) fn unusable_image(&self, relative: &str) -> Result<Option<&'static str>> {
-        if !self.has_referenced_file(relative)? {
-            return Ok(Some("does not exist"));
-        }
-        let start = self.read_start(relative, Texture::SIGNATURE_BYTES as u64)?;
-        self.unsupported_image(relative, &start)
+    /// Whether the parent of this folder of the given order is in the folder of the scene.
+    fn is_in_scene_folder(&self, parents: usize) -> bool {
+        let scene_folder = self.scene_folder.as_ref().unwrap_or(&self.base);
+        self.base.ancestors().nth(parents).is_some_and(|parent| parent.starts_with(scene_folder))
     }
 
-    /// As [`Self::unusable_image`], for an image that starts with the bytes `start`.
+    /// The path of a file whose names equal those of `path` in any letter case.
+    fn find_ignoring_case(&self, path: ReferencePath<'_>) -> Option<String> {
+        let (file, folders) = path.names.split_last()?;
+        let mut names = vec!["..".to_owned(); path.parents];
+        let mut folder = if path.parents == 0 { self.clone() } else { self.within(&names.join("/")).ok()? };
+        for name in folders {
+            let name = folder.name_ignoring_case(name, EntryKind::Directory)?;
+            folder = folder.within(&name).ok()?;
+            names.push(name);
+        }
+        names.push(folder.name_ignoring_case(file, EntryKind::File)?);
+        Some(names.join("/"))
+    }
+
+    /// The name of an entry of this folder that equals `name` in any letter case; `name` itself if there is an entry of
+    /// this name.
+    fn name_ignoring_case(&self, name: &str, kind: EntryKind) -> Option<String> {
+        match self.kind(name) == Ok(Some(kind)) {
+            true => Some(name.to_owned()),
+            false => self.listing().names_ignoring_case(name, kind).next().map(str::to_owned),
+        }
+    }
+
+    /// The reason why an image that starts with the bytes `start` is not drawn, worded as the middle of a remark. `None`
+    /// for a PNG, JPEG or WebP image.
     ///
     /// # Errors
     /// In strict mode, `Invalid` for other formats than PNG, JPEG and WebP.
@@ -166,6 +295,18 @@ impl AssetDir {
     /// As for [`Self::resolve`].
     pub(super) fn within(&self, relative: &str) -> Result<Self> {
         Ok(Self { base: self.resolve(relative)?, ..self.clone() })
+    }
+
+    /// The folder `relative` of a scene or a model. Unless it is in the folder of the scene, it becomes this folder, which
+    /// paths in model files cannot leave.
+    ///
+    /// # Errors
+    /// As for [`Self::resolve`].
+    pub(super) fn within_scene(&self, relative: &str) -> Result<Self> {
+        let folder = self.within(relative)?;
+        let is_inside = folder.scene_folder.as_ref().is_some_and(|scene_folder| folder.base.starts_with(scene_folder));
+        let scene_folder = if is_inside { folder.scene_folder } else { Some(folder.base.clone()) };
+        Ok(Self { scene_folder, ..folder })
     }
 
     /// The last component of the resolved path, or `scene` if it has none or does not resolve.
@@ -312,6 +453,13 @@ impl AssetDir {
     }
 }
 
+impl std::fmt::Display for ReferencePath<'_> {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let names = std::iter::repeat_n("..", self.parents).chain(self.names.iter().copied());
+        formatter.write_str(&names.collect::<Vec<_>>().join("/"))
+    }
+}
+
 /// The folder of a path; `.` if the path is only a file name.
 pub(super) fn parent_of(path: &str) -> &str {
     match path.rsplit_once('/') {
@@ -385,6 +533,43 @@ mod tests {
             assert_eq!(files.kind(path), Ok(None), "{path}");
         }
         assert_eq!(AssetDir::unrestricted(&root).read("../secret.txt", 100).expect("a file")[..], b"secret"[..]);
+    }
+
+    #[test]
+    fn referenced_files_are_exact_then_similar_then_missing() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let root = folder.path().canonicalize().expect("an existing folder");
+        std::fs::create_dir_all(root.join("scene/maps/deep")).expect("a new folder");
+        for path in ["out.png", "scene/a.png", "scene/A.PNG", "scene/maps/a.png", "scene/maps/deep/b.png"] {
+            std::fs::write(root.join(path), "").expect("a writable file");
+        }
+        let files = AssetDir::unrestricted(&root).within_scene("scene").expect("an existing folder");
+        let in_maps = files.within_scene("maps").expect("an existing folder");
+        let exact = |path: &str| ReferencedFile::Exact(path.to_owned());
+        let similar = |path: &str, reason| ReferencedFile::Similar { path: path.to_owned(), reason };
+        let missing = |reason| ReferencedFile::Missing { reason };
+        let long_path = "a/".repeat(1 << 20);
+        for (files, reference, expected) in [
+            (&files, "maps//./a.png", exact("maps/a.png")),
+            (&in_maps, "../a.png", exact("../a.png")),
+            (&in_maps, "deep/../../maps/deep/b.png", exact("../maps/deep/b.png")),
+            (&in_maps, "../Maps/Deep/B.png", similar("../maps/deep/b.png", MISSING)),
+            // A name in other letter case is better than the end of the path, and `A.PNG` precedes `a.png`.
+            (&files, "MAPS/a.png", similar("maps/a.png", MISSING)),
+            (&files, "no/A.png", similar("A.PNG", MISSING)),
+            (&files, "no/a.png", similar("a.png", MISSING)),
+            (&files, "/no/maps/a.png", similar("maps/a.png", OUTSIDE)),
+            (&in_maps, "../../out.png", missing(OUTSIDE)),
+            (&in_maps, "../../scene/a.png", similar("a.png", OUTSIDE)),
+            (&files, "maps", missing(MISSING)),
+            (&files, "maps/", missing(MISSING)),
+            (&files, "", missing(MISSING)),
+            (&files, "/", missing(OUTSIDE)),
+            (&files, "a.png\0", missing(MISSING)),
+            (&files, long_path.as_str(), missing(MISSING)),
+        ] {
+            assert_eq!(files.locate(reference), expected, "{}", reference.get(..40).unwrap_or(reference));
+        }
     }
 
     #[test]

@@ -20,6 +20,8 @@ pub(super) enum EntryKind {
 pub(super) struct FolderListing {
     /// Sorted by name.
     entries: Vec<(String, EntryKind)>,
+    /// Indices of entries by the lower-case form of their names, sorted.
+    by_lower_case: OnceLock<HashMap<String, Vec<usize>>>,
     modes_names: OnceLock<ModesNames>,
 }
 
@@ -28,8 +30,6 @@ pub(super) struct FolderListing {
 pub(super) struct ModesNames {
     /// Names of the models.
     pub(super) models: Vec<String>,
-    /// All names by their lower-case form, sorted.
-    pub(super) by_lower_case: HashMap<String, Vec<String>>,
     /// Names that look like modes and begin with the name of no model, sorted.
     pub(super) unclaimed: Vec<String>,
     /// By model, the names that look like modes and begin with the name of this model only, sorted.
@@ -39,7 +39,7 @@ pub(super) struct ModesNames {
 impl FolderListing {
     pub(super) fn new(mut entries: Vec<(String, EntryKind)>) -> Self {
         entries.sort_by(|a, b| a.0.cmp(&b.0));
-        Self { entries, modes_names: OnceLock::new() }
+        Self { entries, by_lower_case: OnceLock::new(), modes_names: OnceLock::new() }
     }
 
     /// Names and kinds, sorted by name.
@@ -50,6 +50,19 @@ impl FolderListing {
     /// Names of the files, sorted.
     pub(super) fn file_names(&self) -> impl Iterator<Item = &str> {
         self.entries.iter().filter(|(_, kind)| *kind == EntryKind::File).map(|(name, _)| name.as_str())
+    }
+
+    /// The names of this kind that equal `name` in any letter case, sorted.
+    pub(super) fn names_ignoring_case(&self, name: &str, kind: EntryKind) -> impl Iterator<Item = &str> {
+        let by_lower_case = self.by_lower_case.get_or_init(|| {
+            let mut indices: HashMap<String, Vec<usize>> = HashMap::new();
+            for (index, (name, _)) in self.entries.iter().enumerate() {
+                indices.entry(name.to_lowercase()).or_default().push(index);
+            }
+            indices
+        });
+        let entries = by_lower_case.get(&name.to_lowercase()).into_iter().flatten().map(|index| &self.entries[*index]);
+        entries.filter(move |(_, entry_kind)| *entry_kind == kind).map(|(name, _)| name.as_str())
     }
 
     /// The names for the search for modes. The first call derives them with `derive`.

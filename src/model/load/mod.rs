@@ -22,8 +22,10 @@
 //! - Vertices that no face uses are kept, because the rows of U include them, but bounds, ground and cameras
 //!   ignore them.
 //! - Values out of range: module `values` has the table that all formats share.
-//! - A file that does not exist although another file refers to it, and an image that is no PNG, JPEG or WebP image, are
-//!   replaced by a default with a remark. In strict mode, they are errors.
+//! - An image or material library that does not exist or is outside of the folder of the scene, and an image that is no
+//!   PNG, JPEG or WebP image, are replaced by a default with a remark. In strict mode, they are errors. The folder of the
+//!   scene is that of `scene.toml` or, without one or for a model elsewhere, that of the model
+//!   ([`asset_dir::AssetDir::find_referenced`]).
 
 mod asset_dir;
 mod conversion;
@@ -34,6 +36,8 @@ mod far_tests;
 mod file_hashes;
 mod folder_listing;
 mod gltf;
+#[cfg(test)]
+mod image_path_tests;
 mod manifest;
 mod modes;
 mod npz_model;

@@ -214,22 +214,17 @@ mod tests {
         ]);
         std::fs::write(outer.path().join("secret.obj"), TRIANGLE).expect("a writable file");
         std::os::unix::fs::symlink(outer.path(), outer.path().join("root/link")).expect("a symbolic link");
-        for source in [
-            "../secret.obj",
-            "../absent.obj",
-            "/etc/passwd",
-            "/absent",
-            "one/../../secret.obj",
-            "out",
-            "far",
-            "map",
-            "patch",
-        ] {
+        for source in
+            ["../secret.obj", "../absent.obj", "/etc/passwd", "/absent", "one/../../secret.obj", "out", "far", "patch"]
+        {
             let message = repository.open(source, &MemoryReservation::unlimited()).expect_err(source).to_string();
             assert!(message.contains("expected a path inside the repository"), "{source}: {message}");
             let outside = outer.path().to_str().expect("a UTF-8 path");
             assert!(!message.contains(outside), "{source}: {message}");
         }
+        let opened = repository.open("map", &MemoryReservation::unlimited()).expect("a scene without the library");
+        let remark = "material library '../../secret.mtl' is outside of the folder of the scene: it is left out";
+        assert_eq!(opened.scene.remarks, [remark]);
         // Links out of the repository are not found, whether or not their targets exist.
         for source in ["link", "link/secret.obj", "link/absent.obj"] {
             let error = repository.open(source, &MemoryReservation::unlimited()).expect_err(source);

@@ -72,10 +72,10 @@ pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
         None => Err(Error::NotFound { what: "scene", given: source.into() }),
         Some(EntryKind::File) if source.ends_with(".toml") => {
             let folder = parent_of(source);
-            manifest::read(&files.within(folder)?, file_name_of(source), &files.resolved_name(folder))
+            manifest::read(&files.within_scene(folder)?, file_name_of(source), &files.resolved_name(folder))
         }
         Some(EntryKind::Directory) => {
-            let folder = files.within(source)?;
+            let folder = files.within_scene(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
                 Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
                 _ => read_model(files, source, ModelOptions::default()).map(SceneDescription::from),
@@ -100,14 +100,14 @@ pub(super) fn read_model(files: &AssetDir, path: &str, options: ModelOptions) ->
     }
     match files.kind(path)? {
         Some(EntryKind::Directory) => {
-            let folder = files.within(path)?;
+            let folder = files.within_scene(path)?;
             let model = choose_single_model(&folder, path)?;
             let mut parts = read_model_file(&folder, &model, options)?;
             parts.name = files.resolved_name(path);
             Ok(parts)
         }
         Some(EntryKind::File) => {
-            let folder = files.within(parent_of(path))?;
+            let folder = files.within_scene(parent_of(path))?;
             let file_name = file_name_of(path);
             let given = || format!("{file_name}{}", model_hint(file_name));
             let model = recognize_model(file_name)

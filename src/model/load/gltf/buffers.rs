@@ -12,7 +12,7 @@ use super::remarks::sanitize;
 use super::{MAX_FILE_BYTES, get_element};
 use crate::domain::Texture;
 use crate::error::{Result, invalid};
-use crate::load::asset_dir::AssetDir;
+use crate::load::asset_dir::{AssetDir, ReferencedFile};
 use crate::load::polygons::build_bytes;
 use crate::memory::MemoryReservation;
 
@@ -28,6 +28,17 @@ pub(super) struct GltfBuffers<'a> {
     buffers: Vec<Cow<'a, [u8]>>,
     /// The part of [`MEMORY_BUDGET`] that is not used yet.
     remaining_budget: Cell<u64>,
+}
+
+/// Where the bytes of an image are.
+#[derive(Debug)]
+enum ImageSource<'a> {
+    /// A data URI without `data:`.
+    Data(&'a str),
+    /// The index of a buffer view.
+    View(usize),
+    /// The decoded URI of a file.
+    File(String),
 }
 
 impl<'a> GltfBuffers<'a> {
@@ -90,29 +101,55 @@ impl<'a> GltfBuffers<'a> {
     /// # Errors
     /// `Invalid` if the image has no source or the source does not exist.
     pub(super) fn image(&self, index: usize) -> Result<Cow<'_, [u8]>> {
-        let image = &self.document.images[index];
-        match (&image.uri, image.buffer_view) {
-            (Some(uri), _) => Ok(Cow::Owned(self.read_uri(uri)?)),
-            (None, Some(view)) => Ok(Cow::Borrowed(self.view(view)?.0)),
-            (None, None) => Err(invalid("uri", "a URI or a bufferView", "neither")),
+        match self.image_source(index)? {
+            ImageSource::Data(data) => self.decode_data(data).map(Cow::Owned),
+            ImageSource::View(view) => Ok(Cow::Borrowed(self.view(view)?.0)),
+            ImageSource::File(reference) => match self.folder.locate(&reference) {
+                ReferencedFile::Exact(path) | ReferencedFile::Similar { path, .. } => {
+                    self.read_file(&path).map(Cow::Owned)
+                }
+                ReferencedFile::Missing { reason } => {
+                    Err(invalid("uri", "an existing file", format!("'{}', which {reason}", sanitize(&reference, 120))))
+                }
+            },
         }
     }
 
-    /// The reason why an image is not drawn, worded as the end of a remark. `None` for a PNG, JPEG or WebP image.
+    /// Whether an image can be drawn. If not, or if it is another file than that of the URI, adds a remark that begins with
+    /// `subject`; the remark on an image that is not drawn ends with `stand_in`.
     ///
     /// # Errors
-    /// As for [`Self::image`] and [`AssetDir::unusable_image`].
-    pub(super) fn unusable_image(&self, index: usize) -> Result<Option<&'static str>> {
-        let image = &self.document.images[index];
-        let start = match (image.uri.as_deref(), image.buffer_view) {
-            (Some(uri), _) => match uri.strip_prefix("data:") {
-                Some(data) => Cow::Owned(decode_data_uri(signature_of_data_uri(data))?),
-                None => return self.folder.unusable_image(&relative_path(uri)?),
-            },
-            (None, Some(view)) => Cow::Borrowed(self.view(view)?.0),
-            (None, None) => return Err(invalid("uri", "a URI or a bufferView", "neither")),
+    /// As for [`Self::image`] and [`AssetDir::find_image`].
+    pub(super) fn is_usable_image(
+        &self,
+        index: usize,
+        subject: &str,
+        stand_in: &str,
+        remarks: &mut Vec<String>,
+    ) -> Result<bool> {
+        let start = match self.image_source(index)? {
+            ImageSource::Data(data) => Cow::Owned(decode_data_uri(signature_of_data_uri(data))?),
+            ImageSource::View(view) => Cow::Borrowed(self.view(view)?.0),
+            ImageSource::File(reference) => {
+                return Ok(self.folder.find_image(&reference, subject, stand_in, remarks)?.is_some());
+            }
         };
-        self.folder.unsupported_image("in the model", &start[..start.len().min(Texture::SIGNATURE_BYTES)])
+        let start = &start[..start.len().min(Texture::SIGNATURE_BYTES)];
+        let unsupported = self.folder.unsupported_image("in the model", start)?;
+        remarks.extend(unsupported.map(|reason| format!("{subject} {reason}: {stand_in}")));
+        Ok(unsupported.is_none())
+    }
+
+    fn image_source(&self, index: usize) -> Result<ImageSource<'_>> {
+        let image = &self.document.images[index];
+        match (image.uri.as_deref(), image.buffer_view) {
+            (Some(uri), _) => Ok(match uri.strip_prefix("data:") {
+                Some(data) => ImageSource::Data(data),
+                None => ImageSource::File(decode_percent_escapes(uri)),
+            }),
+            (None, Some(view)) => Ok(ImageSource::View(view)),
+            (None, None) => Err(invalid("uri", "a URI or a bufferView", "neither")),
+        }
     }
 
     /// Whether an unusable image is an error instead of a remark.
@@ -152,13 +189,21 @@ impl<'a> GltfBuffers<'a> {
     }
 
     fn read_uri(&self, uri: &str) -> Result<Vec<u8>> {
-        let Some(data) = uri.strip_prefix("data:") else {
-            let limit = MAX_FILE_BYTES.min(self.remaining_budget.get());
-            let content = self.folder.read(&relative_path(uri)?, limit)?;
-            // The reservation of the file ends with the conversion.
-            self.charge_budget(content.len() as u64)?;
-            return Ok(content.into_bytes());
-        };
+        match uri.strip_prefix("data:") {
+            Some(data) => self.decode_data(data),
+            None => self.read_file(&relative_path(uri)?),
+        }
+    }
+
+    fn read_file(&self, path: &str) -> Result<Vec<u8>> {
+        let limit = MAX_FILE_BYTES.min(self.remaining_budget.get());
+        let content = self.folder.read(path, limit)?;
+        // The reservation of the file ends with the conversion.
+        self.charge_budget(content.len() as u64)?;
+        Ok(content.into_bytes())
+    }
+
+    fn decode_data(&self, data: &str) -> Result<Vec<u8>> {
         let content = decode_data_uri(data)?;
         self.charge_budget(content.len() as u64)?;
         Ok(content)
@@ -183,7 +228,7 @@ fn decode_data_uri(data: &str) -> Result<Vec<u8>> {
     STANDARD_PAD_INDIFFERENT.decode(payload).map_err(invalid_base64)
 }
 
-/// The path of a relative URI. A model may read files only in and below its own folder.
+/// The path of the relative URI of a buffer. A model may read buffers only in and below its own folder.
 fn relative_path(uri: &str) -> Result<String> {
     let path = decode_percent_escapes(uri);
     let has_scheme = path.split('/').next().is_some_and(|component| component.contains(':'));

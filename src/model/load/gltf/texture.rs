@@ -58,7 +58,7 @@ impl<'a> TextureLoader<'a> {
         self.buffers.charge_budget(4 * (side as u64).pow(2) * patches)
     }
 
-    /// Whether a texture has no PNG, JPEG or WebP image: its image is a file that does not exist, has another format, or is
+    /// Whether a texture has no PNG, JPEG or WebP image: its image is a file that is not found, has another format, or is
     /// defined by an extension. Adds a remark that ends with `stand_in`.
     ///
     /// # Errors
@@ -75,12 +75,15 @@ impl<'a> TextureLoader<'a> {
             return Ok(true);
         }
         let image = self.image_index_of(texture_info, remarks)?;
-        let unusable = self.buffers.unusable_image(image);
-        let unusable = unusable.map_err(|error| error.prefix_field(&format!("images[{image}]")))?;
-        if let Some(reason) = unusable {
-            remarks.add(format!("image '{}' {reason}: {stand_in}", self.name(image)));
-        }
-        Ok(unusable.is_some())
+        let subject = match self.uri(image) {
+            Some(uri) => format!("image '{}'", sanitize(uri, 120)),
+            None => format!("image '{}'", self.name(image)),
+        };
+        let mut image_remarks = Vec::new();
+        let is_usable = self.buffers.is_usable_image(image, &subject, stand_in, &mut image_remarks);
+        let is_usable = is_usable.map_err(|error| error.prefix_field(&format!("images[{image}]")))?;
+        image_remarks.into_iter().for_each(|remark| remarks.add(remark));
+        Ok(!is_usable)
     }
 
     /// The mean of each of the four channels, 0 to 1. The texture is not added to `textures`.
@@ -133,8 +136,12 @@ impl<'a> TextureLoader<'a> {
 
     fn name(&self, index: usize) -> String {
         let image = &self.document.images[index];
-        let uri = image.uri.as_deref().filter(|uri| !uri.starts_with("data:"));
-        let name = image.name.as_deref().filter(|name| !name.is_empty()).or(uri);
+        let name = image.name.as_deref().filter(|name| !name.is_empty()).or(self.uri(index));
         name.map_or_else(|| format!("image {index}"), |name| sanitize(name, 120))
+    }
+
+    /// The URI of an image that is a file.
+    fn uri(&self, index: usize) -> Option<&str> {
+        self.document.images[index].uri.as_deref().filter(|uri| !uri.starts_with("data:"))
     }
 }

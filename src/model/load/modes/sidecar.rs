@@ -64,13 +64,10 @@ pub(in crate::load) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Side
     let mut file = None;
     for candidate in candidates.iter().filter(|candidate| *candidate != name) {
         let found = match files.kind(candidate)? {
-            Some(EntryKind::File) => Some(candidate),
-            _ => {
-                let same_names = names.by_lower_case.get(&candidate.to_ascii_lowercase());
-                same_names.into_iter().flatten().find(|other| *other != name)
-            }
+            Some(EntryKind::File) => Some(candidate.as_str()),
+            _ => listing.names_ignoring_case(candidate, EntryKind::File).find(|other| *other != name),
         };
-        file = found.filter(|found| find_model(files, found).is_none()).cloned();
+        file = found.filter(|found| find_model(files, found).is_none()).map(str::to_owned);
         if file.is_some() {
             break;
         }
@@ -84,7 +81,6 @@ fn collect_names(files: &AssetDir, listing: &FolderListing) -> ModesNames {
     let mut names = ModesNames { models, ..ModesNames::default() };
     let mut models_by_stem: HashMap<&str, Vec<&str>> = HashMap::new();
     for name in listing.file_names() {
-        names.by_lower_case.entry(name.to_ascii_lowercase()).or_default().push(name.to_owned());
         if recognize_model(name).is_some() {
             models_by_stem.entry(model_stem(name)).or_default().push(name);
         }

@@ -40,7 +40,7 @@ pub(super) fn create_material(
     let alpha = number("d", statements.opacity, [0.0, 1.0]).unwrap_or(1.0);
     let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).unwrap_or(1.0);
     remarks.extend(corrections.remarks(files.is_strict())?);
-    let statements = &without_unusable_images(statements, files, &field_of, remarks)?;
+    let statements = &with_paths_of_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
         .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
     let normal_texture = match &statements.normal_map {
@@ -76,11 +76,11 @@ pub(super) fn create_material(
     material.validated()
 }
 
-/// Removes the images that do not exist or are no PNG, JPEG or WebP images, with a remark for each.
+/// Replaces the paths of images by those of their files, and removes the images that are not drawn, with a remark for each.
 ///
 /// # Errors
-/// `Invalid` with the statement and the file: for an unreadable file and, in strict mode, for any such image.
-fn without_unusable_images(
+/// As for [`AssetDir::find_image`], with the statement.
+fn with_paths_of_images(
     statements: &MtlMaterial,
     files: &AssetDir,
     field_of: &impl Fn(&str) -> String,
@@ -92,12 +92,11 @@ fn without_unusable_images(
         (&mut statements.alpha_map, "map_d", "the surface is opaque"),
         (&mut statements.normal_map, "normal map", "the normals of the mesh are used"),
     ] {
-        let Some(path) = image.as_deref() else { continue };
-        let unusable = files.unusable_image(path).map_err(|error| error.prefix_field(&field_of(statement)))?;
-        if let Some(reason) = unusable {
-            remarks.push(format!("{} '{path}' {reason}: {stand_in}", field_of(statement)));
-            *image = None;
-        }
+        let Some(reference) = image.take() else { continue };
+        let subject = format!("{} '{reference}'", field_of(statement));
+        *image = files
+            .find_image(&reference, &subject, stand_in, remarks)
+            .map_err(|error| error.prefix_field(&field_of(statement)))?;
     }
     Ok(statements)
 }

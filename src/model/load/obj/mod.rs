@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 pub(super) use material::DEFAULT_ALPHA_CUTOFF;
 use parse::ObjFile;
 
-use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, parent_of, stem_of};
+use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, MAX_TEXT_BYTES, ReferencedFile, parent_of, stem_of};
 use super::surface::{self, ModelOptions};
 use super::texture_cache::TextureCache;
 use crate::domain::Material;
@@ -55,7 +55,7 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
 /// Adds the materials that the faces use, in the order of [`super::polygons::PolygonMesh::materials`], and their
 /// textures.
 ///
-/// A material without definition is [`Material::unspecified`], and a library or image that does not exist is left out.
+/// A material without definition is [`Material::unspecified`], and a library or image that is not found is left out.
 /// In strict mode, each of these cases is an error.
 ///
 /// # Errors
@@ -64,16 +64,15 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     let mut texture_cache = TextureCache::default();
     let mut statements_by_name = BTreeMap::new();
     for library in &obj.libraries {
-        for path in library_paths(files, library)? {
-            if !files.has_referenced_file(&path)? {
-                parts.remarks.push(format!("material library '{path}' does not exist"));
-                continue;
-            }
+        for reference in library_references(files, library) {
+            let subject = format!("material library '{reference}'");
+            let path = files.find_referenced(reference, &subject, "it is left out", &mut parts.remarks)?;
+            let Some(path) = path else { continue };
             let library_statements = mtl::parse(&files.read(&path, MAX_TEXT_BYTES)?);
             let library_statements =
                 library_statements.map_err(|error| error.prefix_field(&format!("file '{path}'")))?;
             // Image names are relative to the library.
-            let folder = files.within(parent_of(&path))?;
+            let folder = files.within_scene(parent_of(&path))?;
             statements_by_name
                 .extend(library_statements.into_iter().map(|(name, statements)| (name, (statements, folder.clone()))));
         }
@@ -112,14 +111,17 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     Ok(())
 }
 
-/// The paths in an `mtllib` statement. The statement is one path if a file of this name exists, because file names may
-/// contain spaces. Otherwise, spaces separate several paths.
-fn library_paths(files: &AssetDir, statement: &str) -> Result<Vec<String>> {
-    let path = statement.replace('\\', "/");
-    if files.kind(&path)?.is_some() || !path.contains(' ') {
-        return Ok(vec![path]);
-    }
-    Ok(path.split_ascii_whitespace().map(str::to_owned).collect())
+/// The references to files in an `mtllib` statement. The statement is one reference if a file has its name, because file
+/// names may contain spaces. Otherwise, spaces separate several references, if there is a file for one of them.
+fn library_references<'a>(files: &AssetDir, statement: &'a str) -> Vec<&'a str> {
+    let is_exact = |reference: &str| matches!(files.locate(reference), ReferencedFile::Exact(_));
+    let is_found = |reference: &str| !matches!(files.locate(reference), ReferencedFile::Missing { .. });
+    let words: Vec<&str> = statement.split_ascii_whitespace().collect();
+    let is_whole = words.len() < 2 || is_exact(statement);
+    let is_list = |words: &[&str]| {
+        words.iter().any(|word| is_exact(word)) || (!is_found(statement) && words.iter().any(|word| is_found(word)))
+    };
+    if !is_whole && is_list(&words) { words } else { vec![statement] }
 }
 
 #[cfg(test)]
@@ -192,7 +194,7 @@ mod tests {
         let read = |name: &str| read(&files, name, ModelOptions::default()).expect("a mesh with stand-ins");
         let lib = read("lib.obj");
         let undefined = "undefined materials have the default color (1): 'bark'";
-        assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist", undefined]);
+        assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist: it is left out", undefined]);
         assert_eq!(lib.materials[0], Material::unspecified("bark"));
         assert_eq!(read("use.obj").remarks, ["undefined materials have the default color (1): 'green'"]);
         let map = read("map.obj");
@@ -207,6 +209,39 @@ mod tests {
             remark("normal map", "the normals of the mesh are used"),
         ];
         assert_eq!(map.remarks, expected);
+    }
+
+    /// Names with blanks, several names, and paths of another computer.
+    #[test]
+    fn libraries_are_found_by_their_statement_or_its_words() {
+        let folder = create_folder(&[
+            ("a.mtl", "newmtl a\nKd 1 0 0\n"),
+            ("b.mtl", "newmtl b\nKd 0 1 0\n"),
+            ("my library.mtl", "newmtl c\nKd 0 0 1\n"),
+        ]);
+        let files = AssetDir::unrestricted(folder.path());
+        for (statement, remarks) in [
+            ("a.mtl b.mtl", vec![]),
+            ("my library.mtl", vec![]),
+            ("a.mtl no.mtl", vec!["'no.mtl' does not exist: it is left out"]),
+            ("no library.mtl", vec!["'no library.mtl' does not exist: it is left out"]),
+            ("My Library.mtl", vec!["'My Library.mtl' does not exist: 'my library.mtl' is read"]),
+            (
+                "C:\\my files\\a.mtl",
+                vec!["'C:\\my files\\a.mtl' is outside of the folder of the scene: 'a.mtl' is read"],
+            ),
+            ("../a.mtl", vec!["'../a.mtl' is outside of the folder of the scene: 'a.mtl' is read"]),
+            ("../no.mtl", vec!["'../no.mtl' is outside of the folder of the scene: it is left out"]),
+        ] {
+            let text = format!("mtllib {statement}\n{TRIANGLE}f 1 2 3\n");
+            let obj = ObjFile::parse(text.as_bytes(), None).expect(statement);
+            let mut parts = SceneParts::named("a");
+            add_materials(&obj, &files, &mut parts).expect(statement);
+            assert_eq!(
+                parts.remarks,
+                remarks.iter().map(|remark| format!("material library {remark}")).collect::<Vec<_>>()
+            );
+        }
     }
 
     #[test]

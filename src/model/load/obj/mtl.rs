@@ -136,7 +136,7 @@ impl MtlMaterial {
         if remainder.is_empty() {
             return Err(invalid("path", "the name of an image file", "none"));
         }
-        Ok(Some(remainder.replace('\\', "/")))
+        Ok(Some(remainder.to_owned()))
     }
 }
 
@@ -166,7 +166,7 @@ mod tests {
         assert_eq!(bark.diffuse, Some([0.5; 3]));
         assert_eq!((bark.exponent, bark.opacity), (Some(7.0), Some(0.75)));
         assert_eq!(bark.color_map.as_deref(), Some("my bark.png"));
-        assert_eq!(bark.normal_map.as_deref(), Some("maps/n.png"));
+        assert_eq!(bark.normal_map.as_deref(), Some("maps\\n.png"));
         // One remark for each of the options -s, -clamp and -bm.
         assert_eq!(bark.remarks.len(), 3);
         assert_eq!((materials["black"].diffuse, materials["black"].opacity), (Some([0.0; 3]), Some(0.5)));

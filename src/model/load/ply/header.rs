@@ -49,7 +49,7 @@ impl PlyHeader {
         let name = |comment: &String| {
             let (key, name) = comment.trim().split_once(' ')?;
             let is_image = key.eq_ignore_ascii_case("TextureFile") && !name.trim().is_empty();
-            is_image.then(|| name.trim().replace('\\', "/"))
+            is_image.then(|| name.trim().to_owned())
         };
         self.comments.iter().filter_map(name).collect()
     }

@@ -45,11 +45,10 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
 
 /// Gives a material the image that a comment `TextureFile` names.
 fn set_image(material: &mut Material, files: &AssetDir, image: &str, parts: &mut SceneParts) -> Result<()> {
-    if let Some(reason) = files.unusable_image(image)? {
-        parts.remarks.push(format!("TextureFile '{image}' {reason}: the surface is drawn without it"));
-        return Ok(());
-    }
-    let texture = texture_cache::decode(files, image)?;
+    let subject = format!("TextureFile '{image}'");
+    let path = files.find_image(image, &subject, "the surface is drawn without it", &mut parts.remarks)?;
+    let Some(path) = path else { return Ok(()) };
+    let texture = texture_cache::decode(files, &path)?;
     let mask = AlphaMode::Mask { cutoff: DEFAULT_ALPHA_CUTOFF };
     material.alpha_mode = if texture.has_alpha() { mask } else { AlphaMode::Opaque };
     (material.ambient, material.diffuse) = ([1.0; 3], [1.0; 3]);
