@@ -1,4 +1,8 @@
 //! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
+//!
+//! Programs without ambient light write a gray as Ka, such as black, white or 0.2 of any Kd, so a gray also means Kd. A
+//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd. `illum 0` and `illum 1` have no highlight. Neither has an exponent Ns
+//! that is missing or below 1, with which the highlight would cover the whole lit side; files use 0 for "not specified".
 
 use super::mtl::MtlMaterial;
 use crate::domain::{AlphaMode, Material, Texture};
@@ -32,14 +36,19 @@ pub(super) fn create_material(
         corrections.color(&field_of(statement), color?, "the default is used")
     };
     let diffuse = color("Kd", statements.diffuse).unwrap_or([1.0; 3]);
-    let ambient = color("Ka", statements.ambient).unwrap_or(diffuse);
-    let specular = color("Ks", statements.specular).unwrap_or([0.0; 3]);
+    let is_gray = |color: &[f32; 3]| color[0] == color[1] && color[1] == color[2];
+    let ambient = color("Ka", statements.ambient).filter(|color| !is_gray(color)).unwrap_or(diffuse);
+    let ambient = [0, 1, 2].map(|channel| ambient[channel].min(diffuse[channel]));
+    let specular = color("Ks", statements.specular).filter(|_| !statements.is_matte).unwrap_or([0.0; 3]);
     let mut number = |statement: &str, value: Option<f32>, range: [f32; 2]| {
         corrections.in_range(&field_of(statement), value?, range, "the default is used")
     };
     let alpha = number("d", statements.opacity, [0.0, 1.0]).unwrap_or(1.0);
-    let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).unwrap_or(1.0);
+    let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).filter(|exponent| *exponent >= 1.0);
     remarks.extend(corrections.remarks(files.is_strict())?);
+    if specular != [0.0; 3] && exponent.is_none() {
+        remarks.push(field_of("Ks is not used, because Ns is missing or below 1"));
+    }
     let statements = &with_paths_of_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
         .map_err(|error| error.prefix_field(&field_of("map_Kd, map_d")))?;
@@ -64,9 +73,8 @@ pub(super) fn create_material(
         name: name.to_owned(),
         ambient,
         diffuse,
-        specular,
-        // An exponent near 0 would spread the highlight over the whole lit side. Files use 0 for "not specified".
-        shininess: exponent.max(1.0),
+        specular: exponent.map_or([0.0; 3], |_| specular),
+        shininess: exponent.unwrap_or(1.0),
         alpha,
         color_texture,
         normal_texture,
@@ -188,6 +196,43 @@ mod tests {
         assert_eq!((default.shininess, default.alpha_mode), (1.0, AlphaMode::Opaque));
         let (black, ..) = read("newmtl m\nKd 0 0 0\n", folder.path()).expect("a valid material");
         assert_eq!((black.diffuse, black.ambient), ([0.0; 3], [0.0; 3]));
+    }
+
+    /// A gray is what programs without ambient light write as Ka.
+    #[test]
+    fn ambient_color_is_at_most_the_diffuse_color() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        for (statement, ambient) in [
+            ("Ka 1 1 1", [0.5, 0.0, 0.25]),
+            ("Ka 0 0 0", [0.5, 0.0, 0.25]),
+            ("Ka 0.2 0.2 0.2", [0.5, 0.0, 0.25]),
+            ("Ka 0.1 0 0.2", [0.1, 0.0, 0.2]),
+            ("Ka 0.75 0.75 0.2", [0.5, 0.0, 0.2]),
+        ] {
+            let text = format!("newmtl m\n{statement}\nKd 0.5 0 0.25\n");
+            let (material, _, remarks) = read(&text, folder.path()).expect(statement);
+            assert_eq!((material.ambient, remarks.len()), (ambient, 0), "{statement}");
+        }
+    }
+
+    #[test]
+    fn highlights_need_an_illumination_model_and_an_exponent() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let remark = "material 'm': Ks is not used, because Ns is missing or below 1";
+        for (statements, specular, remarks) in [
+            ("Ns 20", 0.5, vec![]),
+            ("Ns 1\nillum 2", 0.5, vec![]),
+            ("Ns 20\nillum 1", 0.0, vec![]),
+            ("Ns 20\nillum 0", 0.0, vec![]),
+            ("Ns 0\nillum 1", 0.0, vec![]),
+            ("Ns 0", 0.0, vec![remark]),
+            ("Ns 0.4", 0.0, vec![remark]),
+            ("illum 2", 0.0, vec![remark]),
+        ] {
+            let text = format!("newmtl m\nKs 0.5 0.5 0.5\n{statements}\n");
+            let (material, _, given) = read(&text, folder.path()).expect(statements);
+            assert_eq!((material.specular, given), ([specular; 3], remarks.into_iter().map(str::to_owned).collect()));
+        }
     }
 
     #[test]

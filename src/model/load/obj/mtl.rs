@@ -16,6 +16,8 @@ pub(super) struct MtlMaterial {
     pub(super) diffuse: Option<[f32; 3]>,
     pub(super) specular: Option<[f32; 3]>,
     pub(super) exponent: Option<f32>,
+    /// Whether the illumination model has no highlight: `illum 0` or `illum 1`.
+    pub(super) is_matte: bool,
     /// Opacity: `d`, or 1 - `Tr`.
     pub(super) opacity: Option<f32>,
     pub(super) color_map: Option<String>,
@@ -65,13 +67,13 @@ impl MtlMaterial {
             b"kd" => self.diffuse = Some(self.parse_color(line, material_name)?),
             b"ks" => self.specular = Some(self.parse_color(line, material_name)?),
             b"ns" => self.exponent = Some(parse_last_number(line)?),
+            b"illum" => self.is_matte = parse_last_number(line)? < 2.0,
             b"d" => self.opacity = Some(parse_last_number(line)?),
             b"tr" => self.set_transparency(parse_last_number(line)?, material_name),
             b"map_kd" => self.color_map = self.parse_image_path(line, material_name)?,
             b"map_d" => self.alpha_map = self.parse_image_path(line, material_name)?,
             b"norm" | b"map_bump" | b"bump" => self.normal_map = self.parse_image_path(line, material_name)?,
-            // Ambient maps repeat the color map. Illumination models and all other statements have no equivalent in
-            // `Material`.
+            // Ambient maps repeat the color map. All other statements have no equivalent in `Material`.
             _ => {}
         }
         Ok(())
