@@ -2,11 +2,13 @@
 //!
 //! An STL file repeats the coordinates of a vertex in each of its triangles. Equal coordinates become one vertex, and
 //! vertices are numbered by their first occurrence in the file. The rows of U follow this numbering. Normals of facets
-//! and attribute words are not used.
+//! are not used. Attribute words of binary files are colors in one of two formats ([`facet_colors`]).
 //!
 //! The `stl_io` crate (0.11) is not used: it reads a binary file whose header begins with `solid ` as text, ends
 //! silently after the first of several solids, and rejects facets whose normal is not a number, although normals are
 //! redundant.
+
+mod facet_colors;
 
 use std::collections::HashMap;
 
@@ -34,9 +36,12 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
     let content = files.read(name, MAX_MODEL_BYTES)?;
     let memory = files.reserve_polygons(name, content.len())?;
-    let polygons =
+    let mut polygons =
         parse(&content, memory, &mut parts.remarks).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
-    parts.materials.push(Material::unspecified(""));
+    parts.materials = match polygons.face_colors.is_empty() {
+        true => vec![Material::unspecified("")],
+        false => polygons.color_faces(&mut parts.remarks),
+    };
     surface::add_domain(files, name, &polygons, options, None, &mut parts)?;
     Ok(parts)
 }
@@ -58,7 +63,11 @@ fn parse(bytes: &[u8], memory: Option<TemporaryReservation>, remarks: &mut Vec<S
             if size < bytes.len() {
                 remarks.push(format!("{} bytes after the last triangle are not used", bytes.len() - size));
             }
-            parse_binary(&bytes[HEADER_BYTES..size], &mut merger)?;
+            let triangles = &bytes[HEADER_BYTES..size];
+            parse_binary(triangles, &mut merger)?;
+            let attributes = triangles.as_chunks::<TRIANGLE_BYTES>().0.iter();
+            let attributes = attributes.map(|triangle| u16::from_le_bytes([triangle[48], triangle[49]]));
+            merger.polygons.face_colors = facet_colors::decode(&bytes[..HEADER_BYTES - 4], attributes);
         }
         _ if is_text => parse_text(text, &mut merger)?,
         Some(size) => return Err(invalid("size", format!("{size} bytes, as the header declares"), bytes.len())),
@@ -218,6 +227,28 @@ mod tests {
             assert_eq!(vertices, [1, 3, 2]);
         }
         assert_eq!(remarks, ["3 bytes after the last triangle are not used"; 2]);
+    }
+
+    /// Two triangles with colors, in the formats of VisCAM and of Magics, and with attributes that are no colors.
+    #[test]
+    fn attribute_words_are_colors_of_facets() {
+        let words = |header: &[u8], attributes: [u16; 2]| {
+            let mut bytes = binary("", 2, &SQUARE);
+            bytes[..header.len()].copy_from_slice(header);
+            for (triangle, attribute) in attributes.into_iter().enumerate() {
+                let end = HEADER_BYTES + TRIANGLE_BYTES * (triangle + 1);
+                bytes[end - 2..end].copy_from_slice(&attribute.to_le_bytes());
+            }
+            parse(&bytes, None, &mut Vec::new()).expect("a valid file").face_colors
+        };
+        let magics = b"by hand COLOR=\x0a\x14\x1e\xff,MATERIAL=";
+        let (red, blue) = (Some([255, 0, 0]), Some([0, 0, 255]));
+        assert_eq!(words(b"", [0x8000 | (31 << 10), 0x8000 | 31]), [red, blue]);
+        assert_eq!(words(b"", [0x8000 | (16 << 5), 31]), [Some([0, 132, 0]), None]);
+        assert_eq!(words(magics, [31, 0x8000]), [red, Some([10, 20, 30])]);
+        assert_eq!(words(magics, [0, 0]), [Some([10, 20, 30]); 2]);
+        assert!(words(b"", [0, 0]).is_empty());
+        assert!(words(b"", [1, 0x7fff]).is_empty());
     }
 
     #[test]

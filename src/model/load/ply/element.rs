@@ -31,6 +31,8 @@ pub(super) struct PlyFace {
     pub(super) uvs: Vec<f32>,
     /// Index of the image of the face.
     pub(super) texture: Option<f64>,
+    /// 0 to 255.
+    pub(super) color: [f64; 3],
 }
 
 /// An element that is not used.
@@ -62,9 +64,11 @@ impl PlyElement for PlyVertex {
 }
 
 impl PlyElement for PlyFace {
-    fn set_scalar(&mut self, name: &str, value: f64, _: f64) {
+    fn set_scalar(&mut self, name: &str, value: f64, full: f64) {
         if name == "texnumber" {
             self.texture = Some(value);
+        } else if let Some(channel) = ["red", "green", "blue"].iter().position(|channel| *channel == name) {
+            self.color[channel] = 255.0 * value / full;
         }
     }
 

@@ -15,7 +15,8 @@ const MAX_LISTED_NAMES: usize = 8;
 /// The properties that are read, of vertices and faces.
 const VERTEX_PROPERTIES: [&str; 16] =
     ["x", "y", "z", "nx", "ny", "nz", "s", "t", "u", "v", "texture_u", "texture_v", "red", "green", "blue", "alpha"];
-const FACE_PROPERTIES: [&str; 4] = ["vertex_indices", "vertex_index", "texcoord", "texnumber"];
+const FACE_PROPERTIES: [&str; 8] =
+    ["vertex_indices", "vertex_index", "texcoord", "texnumber", "red", "green", "blue", "alpha"];
 
 /// A valid header.
 #[derive(Debug)]

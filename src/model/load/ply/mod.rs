@@ -32,15 +32,31 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     ply.parse(&content).map_err(in_file)?;
     parts.remarks.append(&mut ply.remarks);
     parts.remarks.extend(ply.polygons.corrections.remarks(files.is_strict()).map_err(in_file)?);
-    for name in ply.polygons.materials.clone() {
+    add_materials(&mut ply.polygons, files, &mut parts).map_err(in_file)?;
+    surface::add_domain(files, name, &ply.polygons, options, None, &mut parts)?;
+    Ok(parts)
+}
+
+/// Adds a material per image, or else per color of a face.
+fn add_materials(polygons: &mut PolygonMesh, files: &AssetDir, parts: &mut SceneParts) -> Result<()> {
+    let has_images = polygons.has_uvs() && polygons.materials.iter().any(|name| !name.is_empty());
+    if !polygons.face_colors.is_empty() {
+        let reason = if has_images { Some("the faces have images") } else { None };
+        let reason = reason.or((!polygons.colors.is_empty()).then_some("the vertices have colors"));
+        let Some(reason) = reason else {
+            parts.materials = polygons.color_faces(&mut parts.remarks);
+            return Ok(());
+        };
+        parts.remarks.push(format!("colors of faces are not used, because {reason}"));
+    }
+    for name in &polygons.materials {
         let mut material = Material::unspecified("");
-        if !name.is_empty() && ply.polygons.has_uvs() {
-            set_image(&mut material, files, &name, &mut parts).map_err(in_file)?;
+        if has_images && !name.is_empty() {
+            set_image(&mut material, files, name, parts)?;
         }
         parts.materials.push(material);
     }
-    surface::add_domain(files, name, &ply.polygons, options, None, &mut parts)?;
-    Ok(parts)
+    Ok(())
 }
 
 /// Gives a material the image that a comment `TextureFile` names.
@@ -80,7 +96,7 @@ impl PlyReader {
                     self.add_vertex(&vertex, definition);
                     Ok(())
                 })?,
-                "face" => elements.for_each(|index, face: PlyFace| self.add_face(&face, index))?,
+                "face" => elements.for_each(|index, face: PlyFace| self.add_face(&face, index, definition))?,
                 _ => elements.for_each(|_, Skipped| Ok(()))?,
             }
             body = elements.body;
@@ -112,7 +128,7 @@ impl PlyReader {
         }
     }
 
-    fn add_face(&mut self, face: &PlyFace, index: usize) -> Result<()> {
+    fn add_face(&mut self, face: &PlyFace, index: usize, definition: &ElementDef) -> Result<()> {
         let polygons = &mut self.polygons;
         let field = || format!("face {index}");
         let count = polygons.positions.len();
@@ -142,7 +158,12 @@ impl PlyReader {
         };
         polygons
             .add_face(face.vertices.iter().enumerate().map(corner), material, index)
-            .map_err(|error| error.prefix_field(&field()))
+            .map_err(|error| error.prefix_field(&field()))?;
+        // A face of a line or a point is not added.
+        if definition.properties.contains_key("red") && polygons.faces.len() > polygons.face_colors.len() {
+            polygons.face_colors.push(Some(face.color.map(|channel| channel.round() as u8)));
+        }
+        Ok(())
     }
 }
 

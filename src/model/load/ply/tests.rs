@@ -170,6 +170,35 @@ fn faces_with_several_images_have_a_material_each() {
     assert_eq!(remarks, ["texnumber: expected 0 to 1, got 7 (face 0): the first image is used"]);
 }
 
+/// A line before the faces has a color, too.
+#[test]
+fn colors_of_faces_are_materials_unless_vertices_have_colors() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let read_with = |vertex_properties: &str, channel: &str, colors: [&str; 3], vertex_end: &str| {
+        let text = format!(
+            "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+             {vertex_properties}element face 3\nproperty list uchar int vertex_indices\nproperty {channel} red\n\
+             property {channel} green\nproperty {channel} blue\nend_header\n\
+             0 0 0{vertex_end}\n1 0 0{vertex_end}\n0 1 0{vertex_end}\n2 0 1 {}\n3 0 1 2 {}\n3 2 1 0 {}\n",
+            colors[0], colors[1], colors[2]
+        );
+        std::fs::write(folder.path().join("a.ply"), text).expect("a writable file");
+        read(&AssetDir::unrestricted(folder.path()), "a.ply", ModelOptions::default()).expect("a valid file")
+    };
+    for (channel, colors) in [("uchar", ["9 9 9", "255 0 0", "0 0 255"]), ("float", ["0.5 0 0", "1 0 0", "0 0 1"])] {
+        let parts = read_with("", channel, colors, "");
+        let diffuse: Vec<_> = parts.materials.iter().map(|material| material.diffuse).collect();
+        assert_eq!(diffuse, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]);
+        assert_eq!(parts.domains[0].material_ranges.len(), 2);
+        assert!(!parts.remarks.iter().any(|remark| remark.contains("face.red")), "{:?}", parts.remarks);
+    }
+    let properties = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+    let parts = read_with(properties, "uchar", ["9 9 9", "255 0 0", "0 0 255"], " 0 255 0");
+    assert_eq!((parts.materials.len(), parts.materials[0].diffuse), (1, [0.0, 1.0, 0.0]));
+    let remark = "colors of faces are not used, because the vertices have colors";
+    assert!(parts.remarks.iter().any(|given| given == remark), "{:?}", parts.remarks);
+}
+
 #[test]
 fn truncated_files_are_rejected() {
     for bytes in [ascii().into_bytes(), binary(true)] {

@@ -2,6 +2,7 @@
 
 mod build;
 mod delaunay;
+mod face_colors;
 mod triangulate;
 mod vertex_colors;
 
@@ -59,6 +60,8 @@ pub(super) struct PolygonMesh {
     /// One sRGB color per vertex, after the validation 0 to 1; empty if no vertex has a color.
     pub(super) colors: Vec<[f32; 3]>,
     pub(super) faces: Vec<Face>,
+    /// The sRGB color of each face, if it has one; empty if no face has a color.
+    pub(super) face_colors: Vec<Option<[u8; 3]>>,
     corners: Vec<Corner>,
     /// Number of faces with one or two corners: points and lines.
     small_face_count: usize,
