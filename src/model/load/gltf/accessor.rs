@@ -16,6 +16,9 @@ const U16: u64 = 5123;
 const U32: u64 = 5125;
 const F32: u64 = 5126;
 
+/// The largest number of elements of an accessor without a buffer view, whose elements are zero except for sparse values.
+const MAX_ZEROS: usize = 1 << 22;
+
 /// The types of the components of an attribute.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ComponentTypes {
@@ -54,8 +57,8 @@ impl ComponentTypes {
 pub(super) struct AttributeFormat {
     pub(super) components: ComponentTypes,
     /// The required number of elements. `None` allows any number. This is for the positions, which determine the number
-    /// for the other attributes. With `None`, an accessor without a buffer view (its elements are zero or sparse) is
-    /// rejected, because a large count without data could exhaust the memory.
+    /// for the other attributes. With `None`, an accessor without a buffer view must have sparse values and at most
+    /// [`MAX_ZEROS`] elements, because a large count without data could exhaust the memory.
     pub(super) count: Option<usize>,
 }
 
@@ -95,8 +98,8 @@ impl AccessorReader<'_> {
         if let Some(count) = format.count.filter(|count| *count != accessor.count) {
             return Err(invalid("count", format!("{count}, the number of positions"), accessor.count));
         }
-        if format.count.is_none() && accessor.buffer_view.is_none() {
-            return Err(invalid("bufferView", "an index", "none"));
+        if format.count.is_none() {
+            check_data(accessor)?;
         }
         let packed_bytes = self.pack_elements(accessor, N)?;
         // Components of all types are decoded to four bytes.
@@ -128,9 +131,7 @@ impl AccessorReader<'_> {
 
     fn decode_indices_of(&self, accessor: &Accessor, vertex_count: usize) -> Result<Vec<u32>> {
         check_kind(accessor, "SCALAR")?;
-        if accessor.buffer_view.is_none() {
-            return Err(invalid("bufferView", "an index", "none"));
-        }
+        check_data(accessor)?;
         index_size(accessor.component_type)?;
         let packed_bytes = self.pack_elements(accessor, 1)?;
         self.buffers.charge_budget(4 * accessor.count as u64)?;
@@ -221,6 +222,16 @@ fn elements(
         ));
     }
     Ok(view[offset..].chunks(stride).take(count).map(move |element| &element[..size]))
+}
+
+/// Checks that an accessor has data of its own, and that they limit the number of its elements.
+fn check_data(accessor: &Accessor) -> Result<()> {
+    match (accessor.buffer_view, &accessor.sparse) {
+        (Some(_), _) => Ok(()),
+        (None, Some(_)) if accessor.count <= MAX_ZEROS => Ok(()),
+        (None, Some(_)) => Err(invalid("count", format!("at most {MAX_ZEROS} without a bufferView"), accessor.count)),
+        (None, None) => Err(invalid("bufferView", "an index or sparse values", "neither")),
+    }
 }
 
 fn check_kind(accessor: &Accessor, kind: &str) -> Result<()> {

@@ -174,6 +174,7 @@ impl GltfAssembler<'_> {
         let options = PrimitiveOptions {
             uv_set: self.material_converter.uv_set(primitive.material)?,
             uv_transform: self.material_converter.uv_transform(primitive.material)?,
+            repeats: self.material_converter.repeats(primitive.material)?,
             crease_angle: self.crease_angle,
             joint_matrices,
         };

@@ -1,9 +1,11 @@
 //! Splits a `.gltf` or `.glb` file into its JSON document and its binary chunk.
 
+use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::document::Document;
+use super::remarks::sanitize;
 use crate::error::{Result, invalid};
 use crate::load::text::without_byte_order_mark;
 
@@ -17,6 +19,8 @@ const MAX_COMMAS: usize = 1 << 24;
 const MAX_LOCATABLE_BYTES: usize = 1 << 22;
 /// The first bytes of a GLB. The version, the length of the file and the chunks follow.
 const MAGIC: &[u8] = b"glTF";
+/// What the user of a file of glTF 1.0 can do.
+const UPGRADE: &str = "convert the file to glTF 2.0";
 /// Chunk types of a GLB: the characters "JSON" and "BIN\0" as little-endian u32.
 const JSON: u32 = 0x4E4F_534A;
 const BIN: u32 = 0x004E_4942;
@@ -39,7 +43,7 @@ pub(super) fn split_container(content: &[u8]) -> Result<Container<'_>> {
     }
     let version = read_word(content, 4, "glb.version")?;
     if version != 2 {
-        return Err(invalid("glb.version", "2", version));
+        return Err(invalid("glb.version", "2", format!("{version}: {UPGRADE}")));
     }
     let length = read_word(content, 8, "glb.length")?;
     if u64::from(length) != content.len() as u64 {
@@ -82,7 +86,7 @@ fn read_word(content: &[u8], start: usize, field: &str) -> Result<u32> {
 /// Parses the JSON document.
 ///
 /// # Errors
-/// `Invalid` with the list and the element that do not conform to glTF.
+/// `Invalid` with the list and the element that do not conform to glTF, or with the version of another version.
 pub(super) fn parse_document(json: &[u8]) -> Result<Document> {
     for (character, noun, limit) in [(b'{', "objects", MAX_OBJECTS), (b',', "commas", MAX_COMMAS)] {
         let count = json.iter().filter(|byte| **byte == character).count();
@@ -91,9 +95,31 @@ pub(super) fn parse_document(json: &[u8]) -> Result<Document> {
         }
     }
     serde_json::from_slice(json).map_err(|error| {
+        if let Some(version) = older_version(json) {
+            return invalid("asset.version", "2.0", format!("{}: {UPGRADE}", sanitize(&version, 20)));
+        }
         let (field, given) = locate_error(json).unwrap_or_else(|| ("json".into(), error.to_string()));
         invalid(field, "a glTF 2.0 document", given)
     })
+}
+
+/// The version of a document of glTF 1.0, in which objects with names replace the top-level lists.
+fn older_version(json: &[u8]) -> Option<String> {
+    #[derive(Default, Deserialize)]
+    #[serde(default)]
+    struct VersionedDocument {
+        asset: Value,
+        scenes: Value,
+    }
+    let VersionedDocument { asset, scenes } = serde_json::from_slice(json).ok()?;
+    let version = match asset.get("version") {
+        Some(Value::String(version)) => version.clone(),
+        Some(Value::Number(version)) => version.to_string(),
+        // The version was optional.
+        _ if scenes.is_object() => "1.0".to_owned(),
+        _ => return None,
+    };
+    (!version.starts_with('2')).then_some(version)
 }
 
 /// Finds the first element of a top-level list that does not parse on its own. Returns its field and the reason. The

@@ -197,6 +197,8 @@ pub(super) struct Sampler {
     pub(super) wrap_s: u64,
     #[serde(default = "default_wrap_mode")]
     pub(super) wrap_t: u64,
+    #[serde(default)]
+    pub(super) mag_filter: Option<u64>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -300,6 +302,9 @@ const fn default_mode() -> u64 {
 const fn default_wrap_mode() -> u64 {
     REPEAT
 }
+
+/// The value of OpenGL's `GL_NEAREST`, a filter that the renderer does not support.
+pub(super) const NEAREST: u64 = 9728;
 
 /// The value of OpenGL's `GL_REPEAT`, the only wrap mode that the renderer supports.
 pub(super) const REPEAT: u64 = 10497;

@@ -19,8 +19,15 @@ const GEOMETRY: [&str; 2] = ["EXT_mesh_gpu_instancing", "MSFT_lod"];
 
 /// Name prefixes of extensions that affect only the appearance of surfaces and lights, animations and names. The geometry is
 /// correct without them.
-const APPEARANCE_PREFIXES: [&str; 6] =
-    ["KHR_materials_", "EXT_materials_", "KHR_lights_", "EXT_lights_", "KHR_xmp", "KHR_animation_pointer"];
+const APPEARANCE_PREFIXES: [&str; 7] = [
+    "KHR_materials_",
+    "EXT_materials_",
+    "KHR_techniques_",
+    "KHR_lights_",
+    "EXT_lights_",
+    "KHR_xmp",
+    "KHR_animation_pointer",
+];
 
 /// Checks the required extensions, and adds a remark for each extension that is not read. `name` is the name of the model
 /// without its extension.

@@ -17,7 +17,7 @@
 
 use std::collections::HashMap;
 
-use super::document::{self, Document, TextureInfo, TextureTransform};
+use super::document::{self, Document, REPEAT, TextureInfo, TextureTransform};
 use super::get_element;
 use super::remarks::{ImportRemarks, sanitize};
 use super::texture::TextureLoader;
@@ -66,6 +66,22 @@ impl<'a> MaterialConverter<'a> {
         let material = get_element(&self.document.materials, index, "material")?;
         let base_color_texture = material.pbr_metallic_roughness.base_color_texture.as_ref();
         Ok(base_color_texture.or(material.normal_texture.as_ref()).map(TextureInfo::transform).unwrap_or_default())
+    }
+
+    /// Whether the image of a material repeats along u and along v outside of the range 0 to 1.
+    ///
+    /// # Errors
+    /// `Invalid` if the material does not exist.
+    pub(super) fn repeats(&self, material: Option<usize>) -> Result<[bool; 2]> {
+        let Some(index) = material else { return Ok([true; 2]) };
+        let material = get_element(&self.document.materials, index, "material")?;
+        let textures = [material.pbr_metallic_roughness.base_color_texture.as_ref(), material.normal_texture.as_ref()];
+        let sampler = |texture: &TextureInfo| {
+            let texture = self.document.textures.get(texture.index)?;
+            self.document.samplers.get(texture.sampler?)
+        };
+        let samplers = || textures.into_iter().flatten().filter_map(sampler);
+        Ok([samplers().all(|sampler| sampler.wrap_s == REPEAT), samplers().all(|sampler| sampler.wrap_t == REPEAT)])
     }
 
     /// Applies the colors of a primitive's vertices: adds a copy of the material that has them, and returns the mesh and the

@@ -2,6 +2,8 @@
 //! from the POSITION targets. A vertex has one corner, or one per normal if the primitive has no NORMAL and creases
 //! split it.
 
+use std::ops::RangeInclusive;
+
 use nalgebra::Matrix4;
 
 use super::accessor::{AccessorReader, AttributeFormat, ComponentTypes};
@@ -16,6 +18,8 @@ use crate::load::values::CorrectedValue;
 const TRIANGLES: u64 = 4;
 const STRIP: u64 = 5;
 const FAN: u64 = 6;
+/// The texture coordinates inside of an image, up to rounding.
+const UV_RANGE: RangeInclusive<f32> = -1e-3..=1.001;
 
 /// What the conversion of a primitive depends on besides the primitive.
 #[derive(Debug, Clone, Copy)]
@@ -24,6 +28,8 @@ pub(super) struct PrimitiveOptions<'a> {
     pub(super) uv_set: u32,
     /// The transform of the texture coordinates.
     pub(super) uv_transform: TextureTransform,
+    /// Whether the image of the material repeats along u and along v.
+    pub(super) repeats: [bool; 2],
     pub(super) crease_angle: CreaseAngle,
     /// The matrices of the joints, if the node has a skin.
     pub(super) joint_matrices: Option<&'a [Matrix4<f64>]>,
@@ -117,7 +123,7 @@ fn read_mesh(
     (options, pose): (PrimitiveOptions<'_>, Option<&Pose>),
     remarks: &mut ImportRemarks,
 ) -> Result<(Mesh, [f64; 3])> {
-    let PrimitiveOptions { uv_set, crease_angle, uv_transform, .. } = options;
+    let PrimitiveOptions { uv_set, crease_angle, uv_transform, repeats, .. } = options;
     let indices = match primitive.indices {
         Some(accessor) => {
             reader.decode_indices(accessor, file_positions.len()).map_err(|error| error.prefix_field("indices"))?
@@ -155,6 +161,10 @@ fn read_mesh(
         uvs.iter_mut().for_each(|uv| *uv = uv_transform.apply(*uv));
     }
     remarks.corrections.zero_non_finite(&format!("attributes.{attribute}"), "(0, 0) is used", &mut uvs, 0);
+    let leaves_image = |axis: usize| uvs.iter().any(|uv| !UV_RANGE.contains(&uv[axis]));
+    if (0..2).any(|axis| !repeats[axis] && leaves_image(axis)) {
+        remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
+    }
     let file_normals: Vec<Option<[f32; 3]>> =
         normals.iter().map(|normal| Some(*normal).filter(|normal| *normal != [0.0; 3])).collect();
     if !normals.is_empty() && file_normals.iter().all(Option::is_some) {

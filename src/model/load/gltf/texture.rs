@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use super::buffers::GltfBuffers;
-use super::document::{Document, REPEAT, TextureInfo};
+use super::document::{Document, NEAREST, TextureInfo};
 use super::get_element;
 use super::remarks::{ImportRemarks, sanitize};
 use crate::domain::Texture;
@@ -116,8 +116,8 @@ impl<'a> TextureLoader<'a> {
         let texture_field = format!("textures[{}]", texture_info.index);
         if let Some(sampler) = texture.sampler {
             let sampler = get_element(&self.document.samplers, sampler, &format!("{texture_field}.sampler"))?;
-            if (sampler.wrap_s, sampler.wrap_t) != (REPEAT, REPEAT) {
-                remarks.add("samplers that clamp or mirror are ignored: textures repeat".into());
+            if sampler.mag_filter == Some(NEAREST) {
+                remarks.add("samplers with the filter NEAREST are ignored: textures are interpolated".into());
             }
         }
         let image_index =

@@ -356,11 +356,64 @@ fn unsupported_features_are_reported_or_rejected() {
     for name in ["KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"] {
         read(name, &files.strict()).expect("a supported extension");
     }
-    for name in ["KHR_materials_unlit", "KHR_texture_basisu"] {
+    for name in ["KHR_materials_unlit", "KHR_techniques_webgl", "KHR_texture_basisu"] {
         read(name, &files).expect("an extension that can be ignored");
         let message = read(name, &files.strict()).expect_err("strict mode").to_string();
         assert!(message.contains("expected an extension that is supported"), "{message}");
     }
+}
+
+/// Lists are objects with names in glTF 1.0, whose version was optional.
+#[test]
+fn older_versions_are_named() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = AssetDir::unrestricted(folder.path());
+    let message_of = |content: &[u8]| {
+        super::parse(&files, "model", content, CreaseAngle::default()).map(drop).expect_err("an old file").to_string()
+    };
+    let lists = json!({"scenes": {"main": {"nodes": ["root"]}}, "meshes": {}, "accessors": {}});
+    for (asset, version) in [
+        (json!({"version": "1.0", "profile": {"api": "WebGL"}}), "1.0"),
+        (json!({"version": 1.1}), "1.1"),
+        (json!(null), "1.0"),
+    ] {
+        let mut document = lists.clone();
+        document["asset"] = asset;
+        let expected = format!("asset.version: expected 2.0, got {version}: convert the file to glTF 2.0");
+        assert_eq!(message_of(document.to_string().as_bytes()), expected);
+    }
+    let mut glb = Model::triangle().to_glb();
+    glb[4] = 1;
+    assert_eq!(message_of(&glb), "glb.version: expected 2, got 1: convert the file to glTF 2.0");
+    let mut document = lists;
+    document["asset"] = json!({"version": "2.0"});
+    assert!(!message_of(document.to_string().as_bytes()).contains("asset.version"), "control: the version is right");
+}
+
+/// Positions and indices that are zero except for sparse values.
+#[test]
+fn sparse_accessors_without_dense_values_are_read() {
+    let mut model = Model::triangle();
+    let add_sparse = |model: &mut Model, component: u64, kind: &str, elements: [u8; 2], values: &[u8]| {
+        let (indices, values) = (model.add_view(&elements), model.add_view(values));
+        let sparse = json!({
+            "count": 2, "indices": {"bufferView": indices, "componentType": U8}, "values": {"bufferView": values}
+        });
+        let accessor = json!({"componentType": component, "type": kind, "count": 3, "sparse": sparse});
+        push(&mut model.json["accessors"], accessor)
+    };
+    let moved = [2.0_f32, 0.0, 0.0, 0.0, 3.0, 0.0];
+    let positions = add_sparse(&mut model, F32, "VEC3", [1, 2], bytemuck::cast_slice(&moved));
+    let indices = add_sparse(&mut model, U16, "SCALAR", [0, 1], bytemuck::cast_slice(&[2_u16, 1]));
+    model.primitive()["attributes"]["POSITION"] = positions.into();
+    model.primitive()["indices"] = indices.into();
+    let parts = model.parts();
+    let mesh = &parts.shapes[0].mesh;
+    assert_eq!(mesh.rest_positions(), [[0.0; 3], [2.0, 0.0, 0.0], [0.0, 3.0, 0.0]]);
+    assert_eq!(mesh.triangles()[0].map(|corner| mesh.corners().vertices[corner as usize]), [2, 1, 0]);
+    let large = model.with(&format!("/accessors/{positions}/count"), json!(1_u64 << 30));
+    let message = large.read().map(drop).expect_err("too many zeros").to_string();
+    assert!(message.contains("count: expected at most 4194304 without a bufferView, got 1073741824"), "{message}");
 }
 
 /// Positions as signed shorts in the scale of the node, and normals and texture coordinates as normalized bytes.
