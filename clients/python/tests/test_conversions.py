@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -104,6 +106,33 @@ def write_by_blender(path: Path) -> None:
         pytest.skip(f"needs a Blender that can write {path.suffix}")
 
 
+def write_plain_gltf(path: Path) -> None:
+    """Writes the pyramid without compression."""
+    rows = [line.split() for line in PYRAMID.splitlines()]
+    positions = np.array([[float(word) for word in row[1:]] for row in rows if row[0] == "v"], "<f4")
+    indices = np.array([[int(word) - 1 for word in row[1:]] for row in rows if row[0] == "f"], "<u2")
+    data = positions.tobytes() + indices.tobytes()
+    uri = f"data:application/octet-stream;base64,{base64.b64encode(data).decode()}"
+    bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    document = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3", **bounds},
+            {"bufferView": 1, "componentType": 5123, "count": indices.size, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": positions.nbytes},
+            {"buffer": 0, "byteOffset": positions.nbytes, "byteLength": indices.nbytes},
+        ],
+        "buffers": [{"byteLength": len(data), "uri": uri}],
+    }
+    path.write_text(json.dumps(document))
+
+
 def write_modes(path: Path) -> None:
     path.with_name("scene.toml").write_text(f'model = "pyramid.obj"\nmodes = "{path.name}"\n')
     path.with_name("pyramid.obj").write_text(PYRAMID)
@@ -130,19 +159,24 @@ OTHERS: dict[str, Case] = {
 }
 
 
+def convert_by_hint(scene: str, folder: Path) -> str:
+    """Runs the command of the error about a scene. Returns the name of the converted file."""
+    rejected = inspect(scene, folder)
+    assert rejected.returncode == 3, rejected.stderr
+    hint = re.search(r"\(convert it in its folder with `(.+)` after .+\)$", rejected.stderr)
+    assert hint, rejected.stderr
+    converted = run("sh", "-c", hint[1], folder=folder)
+    assert converted.returncode == 0, converted.stdout + converted.stderr
+    return shlex.split(hint[1])[-1]
+
+
 @pytest.mark.parametrize("extension", list(extensions()))
 def test_command_of_the_error_converts(extension: str, tmp_path: Path):
     write, vertices, triangles = OTHERS.get(extension, (write_volume, 9, 12))
     path = tmp_path / f"{NAME}.{extension}"
     write(path)
     is_modes = write is write_modes
-    rejected = inspect("scene.toml" if is_modes else path.name, tmp_path)
-    assert rejected.returncode == 3, rejected.stderr
-    hint = re.search(r"\(convert it in its folder with `(.+)` after .+\)$", rejected.stderr)
-    assert hint, rejected.stderr
-    converted = run("sh", "-c", hint[1], folder=tmp_path)
-    assert converted.returncode == 0, converted.stdout + converted.stderr
-    output = shlex.split(hint[1])[-1]
+    output = convert_by_hint("scene.toml" if is_modes else path.name, tmp_path)
     assert Path(output).stem == NAME
     if is_modes:
         (tmp_path / "scene.toml").write_text(f'model = "pyramid.obj"\nmodes = "{output}"\n')
@@ -152,6 +186,20 @@ def test_command_of_the_error_converts(extension: str, tmp_path: Path):
     assert vertices is None or total(opened.stdout, "vertices") == vertices
     assert total(opened.stdout, "triangles") >= (triangles or 12)
     assert triangles is None or total(opened.stdout, "triangles") == triangles
+
+
+@pytest.mark.parametrize("extension", ["glb", "gltf"])
+@pytest.mark.parametrize("compression", ["draco", "meshopt"])
+def test_command_of_a_compressed_model_decompresses(compression: str, extension: str, tmp_path: Path):
+    write_plain_gltf(tmp_path / "plain.gltf")
+    name = f"{NAME}.{extension}"
+    run_tool("gltf-transform", compression, "plain.gltf", name, folder=tmp_path)
+    output = convert_by_hint(name, tmp_path)
+    assert output == f"{NAME}.uncompressed.glb"
+    opened = inspect(output, tmp_path)
+    assert opened.returncode == 0, opened.stderr
+    assert total(opened.stdout, "vertices") == 5
+    assert total(opened.stdout, "triangles") == 6
 
 
 def test_extensions_are_those_of_the_page():

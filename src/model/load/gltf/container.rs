@@ -33,12 +33,17 @@ pub(super) struct Container<'a> {
     pub(super) bin: Option<&'a [u8]>,
 }
 
+/// Whether a file is a GLB.
+pub(super) fn is_binary(content: &[u8]) -> bool {
+    content.starts_with(MAGIC)
+}
+
 /// Splits a GLB into its chunks. Any other content is assumed to be JSON.
 ///
 /// # Errors
 /// `Invalid` with the field of the header or the chunk.
 pub(super) fn split_container(content: &[u8]) -> Result<Container<'_>> {
-    if !content.starts_with(MAGIC) {
+    if !is_binary(content) {
         return Ok(Container { json: without_byte_order_mark(content)?, bin: None });
     }
     let version = read_word(content, 4, "glb.version")?;

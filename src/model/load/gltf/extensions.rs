@@ -29,8 +29,7 @@ const APPEARANCE_PREFIXES: [&str; 7] = [
     "KHR_animation_pointer",
 ];
 
-/// Checks the required extensions, and adds a remark for each extension that is not read. `name` is the name of the model
-/// without its extension.
+/// Checks the required extensions, and adds a remark for each extension that is not read. `name` is the name of the file.
 ///
 /// # Errors
 /// `Invalid` for a required extension that compresses or changes geometry, or that is not known. In strict mode, for each
@@ -44,7 +43,7 @@ pub(super) fn check(document: &Document, is_strict: bool, name: &str, remarks: &
             continue;
         }
         if COMPRESSIONS.contains(&extension) {
-            let given = format!("{given}{}", compression_hint(&format!("{name}.glb")));
+            let given = format!("{given}{}", compression_hint(name));
             return Err(invalid(field, "geometry without compression", given));
         }
         if GEOMETRY.contains(&extension) {

@@ -53,7 +53,8 @@ fn parse(folder: &AssetDir, name: &str, content: &[u8], crease_angle: CreaseAngl
     let document = container::parse_document(container.json)?;
     let mut remarks = ImportRemarks::default();
     check_version(&document)?;
-    extensions::check(&document, folder.is_strict(), name, &mut remarks)?;
+    let extension = if container::is_binary(content) { "glb" } else { "gltf" };
+    extensions::check(&document, folder.is_strict(), &format!("{name}.{extension}"), &mut remarks)?;
     report_ignored_features(&document, &mut remarks);
     let buffers = GltfBuffers::load(&document, folder, container.bin)?;
     assemble::assemble(name, &document, &buffers, crease_angle, remarks)

@@ -353,6 +353,9 @@ fn unsupported_features_are_reported_or_rejected() {
         let message = read(name, &files).expect_err(name).to_string();
         assert!(message.starts_with("extensionsRequired[0]") && message.contains(expected), "{message}");
     }
+    let text = Model::triangle().with("/extensionsRequired", json!(["KHR_draco_mesh_compression"])).json.to_string();
+    let message = super::parse(&files, "model", text.as_bytes(), CreaseAngle::default()).map(drop).expect_err("a text");
+    assert!(message.to_string().contains("copy model.gltf model.uncompressed.glb"), "{message}");
     for name in ["KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"] {
         read(name, &files.strict()).expect("a supported extension");
     }
