@@ -27,6 +27,7 @@ import * as format from "./ui/format";
 import { Help } from "./ui/help";
 import { Notices } from "./ui/notices";
 import { Panel } from "./ui/panel";
+import { RemarksSection } from "./ui/remarks";
 import { defaultSettings } from "./ui/settings";
 import { StatusPanels } from "./ui/status_panels";
 import type { Toolbar } from "./ui/toolbar";
@@ -41,6 +42,7 @@ export class App implements CommandHandlers {
     readonly notices = new Notices();
     readonly settings = defaultSettings();
     readonly status: StatusPanels;
+    private readonly remarks: RemarksSection;
     private readonly toolbar: Toolbar;
     private readonly panel = new Panel();
     private readonly help = new Help();
@@ -65,6 +67,7 @@ export class App implements CommandHandlers {
             stop: () => this.session?.driver?.stopAnimation(),
             reset: (domain) => this.session?.driver?.reset(domain),
         });
+        this.remarks = new RemarksSection(this.panel, this.notices);
         this.panel.add("View", this.view.element, true);
         this.panel.add("Coordinates", this.coordinates.element, true);
         this.panel.add("Domains", this.domains.element, false);
@@ -130,6 +133,7 @@ export class App implements CommandHandlers {
         this.domains.setScene(scene);
         this.panel.setCount("Domains", format.count(scene.domains.length));
         this.status.showScene(scene.info);
+        this.remarks.set(scene.info.remarks);
         this.frameOnce(scene);
         this.connectSession(session);
         this.coordinates.setScene(
@@ -154,6 +158,7 @@ export class App implements CommandHandlers {
         this.viewport.setScene(null);
         this.driveHint = "";
         this.notices.hide("receiver");
+        this.remarks.set([]);
         this.bar.setTimeScale("");
         this.forceLines.setSession(null);
     }

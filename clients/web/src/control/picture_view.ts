@@ -21,6 +21,8 @@ export class PictureView {
     frames = 0;
     skipped = 0n;
     lastFrameBytes = 0;
+    /** How far the lowest vertex of the last frame lies below the ground, in meters. */
+    belowGround = 0;
     stages: readonly StageTime[] = [];
     onFrame: () => void = () => {};
     onError: (message: string) => void = () => {};
@@ -102,6 +104,7 @@ export class PictureView {
                 format = head.format;
                 this.skipped += head.skipped;
                 this.stages = head.stages;
+                this.belowGround = head.belowGround;
             }
             data.set(bytes, Number(offset));
             if (Number(offset) + bytes.length === data.length) await this.draw(data, format);

@@ -4,18 +4,33 @@ import { byId, h, setText } from "./dom";
 
 export class Panel {
     private readonly element = byId("panel");
-    private readonly counts = new Map<string, HTMLElement>();
+    private readonly sections = new Map<string, { section: HTMLDetailsElement; count: HTMLElement }>();
     onToggle: (isOpen: boolean) => void = () => {};
 
     add(title: string, body: HTMLElement, isOpen: boolean): void {
         const count = h("span", { className: "count" });
-        this.counts.set(title, count);
-        this.element.append(h("details", { open: isOpen }, h("summary", {}, title, count), body));
+        const section = h("details", { open: isOpen }, h("summary", {}, title, count), body);
+        this.sections.set(title, { section, count });
+        this.element.append(section);
     }
 
     setCount(title: string, text: string): void {
-        const count = this.counts.get(title);
-        if (count) setText(count, text);
+        const entry = this.sections.get(title);
+        if (entry) setText(entry.count, text);
+    }
+
+    setVisible(title: string, isVisible: boolean): void {
+        const entry = this.sections.get(title);
+        if (entry) entry.section.hidden = !isVisible;
+    }
+
+    /** Opens the panel and one of its sections. */
+    reveal(title: string): void {
+        this.isOpen = true;
+        const section = this.sections.get(title)?.section;
+        if (!section) return;
+        section.open = true;
+        section.scrollIntoView({ block: "nearest" });
     }
 
     get isOpen(): boolean {

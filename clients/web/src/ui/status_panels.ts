@@ -52,7 +52,6 @@ export class StatusPanels {
             Size: `${size} m`,
             Unit: unit === 1 ? null : `${format.short(unit)} m`,
             "Up axis": info.up,
-            Remarks: info.remarks.length > 0 ? info.remarks.join("; ") : null,
         });
     }
 
@@ -86,6 +85,9 @@ export class StatusPanels {
                 stages.length > 0
                     ? `${stages.map(({ stage, milliseconds }) => `${stage} ${milliseconds.toFixed(2)}`).join(", ")} ms`
                     : null,
+            // The server's ground hides no geometry, so such geometry seems to be in front of the ground.
+            "Below the ground":
+                settings.pictures && pictures && pictures.belowGround > 0 ? format.meters(pictures.belowGround) : null,
             "Drawn with": settings.pictures ? "pictures of the server" : viewport.rendererName,
         });
     }

@@ -174,6 +174,27 @@ test("the modes of a surface are computed, and the part is pulled", { timeout: L
     await close(shown);
 });
 
+test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, async () => {
+    // A triangle of 200 m, which may be one of 200 mm.
+    const triangle = "mtllib absent.mtl\nv 0 0 0\nv 200 0 0\nv 0 200 0\nf 1 2 3\n";
+    const shown = await view("triangle.obj", triangle, ["--no-sim"]);
+    const { page } = shown;
+    const notice = page.locator(".notice", { hasText: "2 remarks on the files of this scene." });
+    await notice.getByRole("button", { name: "Show" }).click();
+    await notice.waitFor({ state: "hidden" });
+    const remarks = await page.locator("ul.remarks li").allTextContents();
+    assert.equal(remarks[0], "material library 'absent.mtl' does not exist");
+    assert.match(remarks[1] ?? "", /^the scene is 200 x 200 x 0 m; if its file is in millimeters, pass --unit mm/);
+    assert.equal(remarks.length, 2);
+    assert.equal(await page.locator("ul.remarks").isVisible(), true);
+    await takeScreenshot(page, "view-remarks");
+    await close(shown);
+    const plain = await view("triangle.obj", triangle.replace("mtllib absent.mtl\n", ""), ["--no-sim", "--unit", "mm"]);
+    assert.equal(await plain.page.locator(".notice").count(), 0, "control");
+    assert.equal(await plain.page.locator("summary", { hasText: "Remarks" }).isVisible(), false, "control");
+    await close(plain);
+});
+
 /** Its vibrations of 206 Hz are slowed down by default, so that they are seen. */
 test("a stiff body is shown in slow motion, which the page names", { timeout: LIMIT_MS }, async () => {
     const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
