@@ -147,6 +147,19 @@ def test_invalid_pictures_name_expected_and_given(beams: mc.Scene):
     assert "8192" in error.value.expected
 
 
+def test_remarks_name_what_color_does_not_show(beams: mc.Scene):
+    assert beams.frame(**SIZE).remarks == ()
+    moved = np.eye(4)
+    with beams.drive() as drive:
+        moved[1, 3] = -0.5
+        drive.step(transforms={"beam": moved})
+        assert beams.frame(**SIZE).remarks == ("vertices lie up to 0.5000 m below the ground, which hides no geometry",)
+        moved[:3, 3] = (1e5, 0, 0)
+        drive.step(transforms={"beam": moved, "copy": moved})
+        (remark,) = beams.frame(**SIZE).remarks
+        assert remark.startswith("no domain is in the view of the rest state")
+
+
 def test_frames_follow_a_drive(beams: mc.Scene):
     with beams.drive() as drive, beams.frames(delivery="lossless", count=3, **SIZE) as frames:
         for number in range(3):

@@ -143,6 +143,22 @@ def test_uploaded_files_are_reused(client: mc.Client, tmp_path: Path):
     single.delete()
 
 
+def test_remarks_are_logged_when_a_scene_is_opened(client: mc.Client, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    (tmp_path / "two.obj").write_text(OBJ)
+    scene = client.upload_files(tmp_path / "two.obj", "remarks")
+    assert "material library 'two.mtl' does not exist" in scene.remarks
+    assert caplog.messages == [f"scene 'remarks': {remark}" for remark in scene.remarks]
+    assert {(record.name, record.levelname) for record in caplog.records} == {("modalcast", "WARNING")}
+    caplog.clear()
+    assert client.scene("remarks").remarks == scene.remarks
+    scene.delete()
+    (tmp_path / "two.mtl").write_text(MTL)
+    complete = client.upload_files(tmp_path, "remarks", "two.obj")
+    assert complete.remarks == ()
+    complete.delete()
+    assert caplog.messages == []
+
+
 def test_files_that_cannot_be_uploaded_are_named(client: mc.Client, tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="missing"):
         client.upload_files(tmp_path / "missing", "files")

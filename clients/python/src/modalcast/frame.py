@@ -289,6 +289,18 @@ class Frame:
         """Milliseconds by stage of the first image; `common.proto` lists the stages."""
         return stage_times(next(iter(self.images.values())).head.stages)
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Reasons why color may be misread: vertices below the ground, or domains that have left the default view."""
+        heads = [image.head for image in self.images.values()]
+        remarks: list[str] = []
+        if any(head.reframed for head in heads):
+            remarks.append("no domain is in the view of the rest state: the frame shows them where they are")
+        depth = max(head.below_ground for head in heads)
+        if depth > 0:
+            remarks.append(f"vertices lie up to {depth:.4f} m below the ground, which hides no geometry")
+        return tuple(remarks)
+
     def png(self) -> bytes:
         """Color as a PNG file. Encoded here unless the frame was requested as PNG.
 

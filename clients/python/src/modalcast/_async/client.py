@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ from modalcast.upload import LocalFile, Progress, SceneBuilder, file_messages, l
 from modalcast.v1 import scenes_pb2, server_pb2
 
 RequestT = TypeVar("RequestT")
+
+_LOGGER = logging.getLogger("modalcast")
 
 # Number of hashes in one request; the limit of the server.
 _FILES_PER_REQUEST = 4096
@@ -84,6 +87,8 @@ class Client:
     async def open(self, source: str = "tree", name: str = "", *, timeout: float | None = None) -> Scene:
         """Opens a scene of the server, or returns the scene that is already open under this name.
 
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
+
         Args:
             source: A built-in name such as "tree", or a path inside the server's folder of scenes.
             name: The name that the scene gets; empty: the last component of the source without extension.
@@ -103,7 +108,7 @@ class Client:
             sources = (await self.scenes(timeout=timeout)).sources
             error.args = (f"{error}; the server has the sources {sources[:20]}",)
             raise
-        return await self._scene(reply.scene)
+        return await self._opened_scene(reply.scene)
 
     async def scene(self, name: str, *, timeout: float | None = None) -> Scene:
         """Returns an open scene by its name, for example an uploaded one.
@@ -166,6 +171,8 @@ class Client:
     ) -> Scene:
         """Uploads meshes and modes and opens them as a scene, which the server keeps until it is deleted.
 
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
+
         Args:
             builder: The scene.
             replace: Whether to delete an open scene of this name first.
@@ -180,7 +187,7 @@ class Client:
         if replace:
             await self.delete(builder.name, missing_ok=True)
         reply = await self._transport.upload(UPLOAD_ARRAYS, builder.messages(progress), timeout)
-        return await self._scene(reply.scene)
+        return await self._opened_scene(reply.scene)
 
     async def upload_files(
         self,
@@ -193,6 +200,8 @@ class Client:
         timeout: float | None = None,
     ) -> Scene:
         """Uploads a folder or a file and opens it as a scene. Contents that the server already has are not sent.
+
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
 
         Args:
             path: The folder or the file.
@@ -221,7 +230,7 @@ class Client:
                 raise
             # Another client has deleted a scene with one of these contents in the meantime: send all.
             reply = await self._send_files(name, entry, files, {}, progress, timeout)
-        return await self._scene(reply.scene)
+        return await self._opened_scene(reply.scene)
 
     async def delete(self, name: str, *, missing_ok: bool = False, timeout: float | None = None) -> None:
         """Closes a scene, and removes the files of an uploaded one.
@@ -256,6 +265,13 @@ class Client:
         return await open_scene(
             self, self._transport, info, self._force_owner, timeout=self._timeout, reconnect=self._reconnect
         )
+
+    async def _opened_scene(self, info: scenes_pb2.SceneInfo) -> Scene:
+        """The scene that a call has opened. Logs its remarks."""
+        scene = await self._scene(info)
+        for remark in scene.remarks:
+            _LOGGER.warning("scene '%s': %s", scene.name, remark)
+        return scene
 
     async def _known_contents(self, files: Sequence[LocalFile]) -> dict[bytes, bool]:
         hashes = list({file.sha256 for file in files})

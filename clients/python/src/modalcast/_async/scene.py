@@ -109,6 +109,11 @@ class Scene:
         """Number of coordinates q of all domains."""
         return self.info.coordinates
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Warnings of the loader, for example about missing images and an implausible size. Empty for most scenes."""
+        return tuple(self.info.remarks)
+
     def __repr__(self) -> str:
         counts = f"{len(self.domains)} domains, {self.vertex_count} vertices, {self.coordinate_count} coordinates"
         return f"<Scene '{self.name}': {counts}>"

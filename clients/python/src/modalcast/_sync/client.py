@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,8 @@ from modalcast.upload import LocalFile, Progress, SceneBuilder, file_messages, l
 from modalcast.v1 import scenes_pb2, server_pb2
 
 RequestT = TypeVar("RequestT")
+
+_LOGGER = logging.getLogger("modalcast")
 
 # Number of hashes in one request; the limit of the server.
 _FILES_PER_REQUEST = 4096
@@ -86,6 +89,8 @@ class Client:
     def open(self, source: str = "tree", name: str = "", *, timeout: float | None = None) -> Scene:
         """Opens a scene of the server, or returns the scene that is already open under this name.
 
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
+
         Args:
             source: A built-in name such as "tree", or a path inside the server's folder of scenes.
             name: The name that the scene gets; empty: the last component of the source without extension.
@@ -105,7 +110,7 @@ class Client:
             sources = (self.scenes(timeout=timeout)).sources
             error.args = (f"{error}; the server has the sources {sources[:20]}",)
             raise
-        return self._scene(reply.scene)
+        return self._opened_scene(reply.scene)
 
     def scene(self, name: str, *, timeout: float | None = None) -> Scene:
         """Returns an open scene by its name, for example an uploaded one.
@@ -168,6 +173,8 @@ class Client:
     ) -> Scene:
         """Uploads meshes and modes and opens them as a scene, which the server keeps until it is deleted.
 
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
+
         Args:
             builder: The scene.
             replace: Whether to delete an open scene of this name first.
@@ -182,7 +189,7 @@ class Client:
         if replace:
             self.delete(builder.name, missing_ok=True)
         reply = self._transport.upload(UPLOAD_ARRAYS, builder.messages(progress), timeout)
-        return self._scene(reply.scene)
+        return self._opened_scene(reply.scene)
 
     def upload_files(
         self,
@@ -195,6 +202,8 @@ class Client:
         timeout: float | None = None,
     ) -> Scene:
         """Uploads a folder or a file and opens it as a scene. Contents that the server already has are not sent.
+
+        The logger "modalcast" writes the remarks of the scene (`Scene.remarks`) as warnings.
 
         Args:
             path: The folder or the file.
@@ -223,7 +232,7 @@ class Client:
                 raise
             # Another client has deleted a scene with one of these contents in the meantime: send all.
             reply = self._send_files(name, entry, files, {}, progress, timeout)
-        return self._scene(reply.scene)
+        return self._opened_scene(reply.scene)
 
     def delete(self, name: str, *, missing_ok: bool = False, timeout: float | None = None) -> None:
         """Closes a scene, and removes the files of an uploaded one.
@@ -258,6 +267,13 @@ class Client:
         return open_scene(
             self, self._transport, info, self._force_owner, timeout=self._timeout, reconnect=self._reconnect
         )
+
+    def _opened_scene(self, info: scenes_pb2.SceneInfo) -> Scene:
+        """The scene that a call has opened. Logs its remarks."""
+        scene = self._scene(info)
+        for remark in scene.remarks:
+            _LOGGER.warning("scene '%s': %s", scene.name, remark)
+        return scene
 
     def _known_contents(self, files: Sequence[LocalFile]) -> dict[bytes, bool]:
         hashes = list({file.sha256 for file in files})
