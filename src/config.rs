@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::load::LoadOptions;
 
 /// The deformation backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -139,6 +140,8 @@ pub struct Config {
     pub viewer_recording: Option<ViewerRecording>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
     pub scenes: Option<PathBuf>,
+    /// How scenes are read; see `SceneRepository::with_options`.
+    pub load_options: LoadOptions,
     /// The folder for uploads, the list of open scenes and their last steps. Only one server at a time can use it.
     pub state: PathBuf,
     pub backend: BackendChoice,
@@ -242,6 +245,7 @@ impl Default for Config {
             viewer_token: None,
             viewer_recording: None,
             scenes: None,
+            load_options: LoadOptions::default(),
             state: default_state(),
             backend: BackendChoice::Auto,
             cuda_device: 0,

@@ -13,6 +13,7 @@ use sha2::{Digest, Sha256};
 use tokio::io::AsyncReadExt as _;
 use tokio::process::Command;
 
+use super::loading_options::LoadingOptions;
 use super::modeling_options::ModelingOptions;
 use super::serve::TerminationSignals;
 use super::{Completion, print_line, sibling};
@@ -56,11 +57,12 @@ pub(super) enum Computed {
 ///
 /// # Errors
 /// `Unavailable` if the program is missing, was built from other sources, or the cache folder cannot be written.
-pub(super) async fn compute(source: &str, options: &ModelingOptions) -> Result<Computed> {
+pub(super) async fn compute(source: &str, loading: &LoadingOptions, options: &ModelingOptions) -> Result<Computed> {
     let program = sibling::MODES.checked_path()?;
     let cache = Cache::new(cache_folder(|name| std::env::var_os(name))?);
     let mut signals = TerminationSignals::install()?;
-    let key = entry_key(source, options, &program);
+    let result_arguments = [loading.arguments(), options.result_arguments()].concat();
+    let key = entry_key(source, &result_arguments, &program);
     let name = format!("{}-{key}", short_stem(source));
     let file_name = format!("{}.npz", stem_of(source));
     if let Some(file) = cache.find(&name, &file_name) {
@@ -69,7 +71,7 @@ pub(super) async fn compute(source: &str, options: &ModelingOptions) -> Result<C
         return Ok(Computed::File(file));
     }
     let folder = cache.create()?;
-    let flags = [vec!["--progress=auto".to_owned()], options.arguments()].concat();
+    let flags = [vec!["--progress=auto".to_owned()], loading.arguments(), options.arguments()].concat();
     let output = folder.path().join(&file_name);
     let is_about_output = |line: &&str| line.contains(&*output.to_string_lossy());
     let mut command = Command::new(&program);
@@ -161,8 +163,8 @@ fn cache_folder(variable: impl Fn(&str) -> Option<std::ffi::OsString>) -> Result
     })
 }
 
-/// A hash of everything that determines the result: the content of the surface, the options and the program.
-fn entry_key(source: &str, options: &ModelingOptions, program: &Path) -> String {
+/// A hash of everything that determines the result: the content of the surface, the arguments and the program.
+fn entry_key(source: &str, arguments: &[String], program: &Path) -> String {
     let mut hash = Sha256::new();
     // Length prefixes keep two parts from reading like two others.
     let mut add = |part: &[u8]| {
@@ -172,7 +174,6 @@ fn entry_key(source: &str, options: &ModelingOptions, program: &Path) -> String 
     add(crate::BUILD.as_bytes());
     // The hash of the build is not that of the program's own sources.
     add(&file_version(program));
-    let arguments = options.result_arguments();
     add(&(arguments.len() as u64).to_le_bytes());
     arguments.iter().for_each(|argument| add(argument.as_bytes()));
     add(source.rsplit('/').next().unwrap_or_default().as_bytes());
@@ -348,8 +349,9 @@ mod tests {
     fn key_changes_with_content_options_program_and_referenced_files() {
         let folder = folder();
         let path = |name: &str| folder.path().join(name);
-        let key =
-            |name: &str, options: &ModelingOptions| entry_key(&path(name).to_string_lossy(), options, &path("program"));
+        let key = |name: &str, options: &ModelingOptions| {
+            entry_key(&path(name).to_string_lossy(), &options.result_arguments(), &path("program"))
+        };
         write(path("program"), b"1");
         write(path("a.obj"), b"mtllib a b.mtl\nmtllib b.mtl c.mtl\nv 0 0 0\n");
         write(path("a b.mtl"), b"1");

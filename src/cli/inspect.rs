@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use serde_json::{Value, json};
 
+use super::loading_options::LoadingOptions;
 use super::options::{remark_lines, with_spinner};
 use super::{Completion, Outcome, print_line};
 use modalcast_compute::gpu::{self, CudaDeformerOptions, DeformPlan};
@@ -25,25 +26,21 @@ const MAX_NOTE_CHARS: usize = 100;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   modalcast inspect tree
+  modalcast inspect part.stl --unit mm
   modalcast inspect path/to/model.glb --json")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
     /// one model.
     scene: String,
-    /// Treat missing material libraries, materials and images, and images of unsupported formats, as errors instead of
-    /// remarks.
-    #[arg(long)]
-    strict: bool,
+    #[command(flatten)]
+    loading: LoadingOptions,
     /// Print the description as JSON.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn run(args: &Args) -> Outcome {
-    let opened_scene = with_spinner("loading", || match args.strict {
-        true => load::open_strict(&args.scene),
-        false => load::open(&args.scene),
-    })?;
+    let opened_scene = with_spinner("loading", || load::open_with(&args.scene, &args.loading.load_options()))?;
     if args.json {
         let report = serde_json::to_value(SceneReport::new(&opened_scene)).map_err(fault_in("inspect"))?;
         print_line(serde_json::to_string_pretty(&report).map_err(fault_in("inspect"))?);

@@ -5,6 +5,7 @@ mod computed_modes;
 mod demo;
 mod doctor;
 mod inspect;
+mod loading_options;
 mod modeling_options;
 pub mod options;
 mod physics;

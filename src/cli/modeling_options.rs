@@ -21,12 +21,6 @@ pub(crate) struct ModelingOptions {
     /// Damping of all modes as a fraction of critical damping, such as 0.01 [default: that of the material].
     #[arg(long, value_name = "RATIO", allow_hyphen_values = true)]
     pub(crate) damping: Option<f64>,
-    /// Unit of the lengths in the file: m, mm, cm, um, in or ft [default: m].
-    #[arg(long, value_name = "UNIT")]
-    pub(crate) unit: Option<String>,
-    /// Axis of the file that points up: x, y or z [default: that of the file's format].
-    #[arg(long, value_name = "AXIS")]
-    pub(crate) up: Option<String>,
     /// Region that does not move, such as 'z < 0.01', 'x < 0 && y > 1', 'group NAME' or 'near X Y Z RADIUS'. Lengths and
     /// axes are those of the file; can be repeated [default: the part is free].
     #[arg(long, value_name = "REGION", allow_hyphen_values = true)]
@@ -61,14 +55,11 @@ impl ModelingOptions {
         // Values can start with '-', so a flag and its value are one argument.
         let number = |flag: &str, value: Option<f64>| value.map(|value| format!("--{flag}={value:?}"));
         let count = |flag: &str, value: Option<usize>| value.map(|value| format!("--{flag}={value}"));
-        let text = |flag: &str, value: &Option<String>| value.as_ref().map(|value| format!("--{flag}={value}"));
         let single = [
             count("modes", self.modes),
             number("max-frequency", self.max_frequency),
             count("freedoms", self.freedoms),
             number("damping", self.damping),
-            text("unit", &self.unit),
-            text("up", &self.up),
             number("thickness", self.thickness),
         ];
         let repeated = [("material", &self.material), ("clamp", &self.clamp), ("point-mass", &self.point_mass)];
@@ -97,13 +88,13 @@ mod tests {
     #[test]
     fn arguments_give_the_same_options() {
         let words = "--modes 30 --max-frequency 1e4 --freedoms 9000 --material steel --material a:E=1e9,nu=0.3,rho=1 \
-                     --damping 0.02 --unit mm --up y --clamp -z<0.1 --clamp=x>1 --thickness 0.1 --threads 2";
+                     --damping 0.02 --clamp -z<0.1 --clamp=x>1 --thickness 0.1 --threads 2";
         let mut words: Vec<String> = words.split_whitespace().map(str::to_owned).collect();
         words.extend(["--point-mass".to_owned(), "-1 0 0 2.5".to_owned()]);
         let options = parse(&words);
         assert_eq!((options.modes, options.max_frequency, options.threads), (Some(30), Some(1e4), Some(2)));
         assert_eq!((options.clamp.join(";"), options.point_mass.join(";")), ("-z<0.1;x>1".into(), "-1 0 0 2.5".into()));
-        assert_eq!(options.arguments().len(), 13);
+        assert_eq!(options.arguments().len(), 11);
         assert_eq!(parse(&options.arguments()), options);
         assert!(options.is_requested());
         let one_thread = ModelingOptions { threads: Some(1), ..options.clone() };

@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use super::loading_options::LoadingOptions;
 use super::options::{parse_point, remark_lines, with_spinner};
 use super::{Completion, Outcome, print_line};
 use crate::config::{BackendChoice, Config, RendererChoice};
@@ -18,12 +19,15 @@ use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Lens, LookPreset, Me
 #[command(after_help = "Examples:
   modalcast render tree --out tree.png
   modalcast render path/to/simpleBridge --q bent.npy --out bridge.png --size 1920x1080
+  modalcast render part.stl --unit mm --up y --out part.png
   modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0 --look best
   modalcast render tree --q bent.npy --output displacement --largest 0.5 --out moved.png")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
     /// one model.
     scene: String,
+    #[command(flatten)]
+    loading: LoadingOptions,
     /// Coordinates q of all domains in order, concatenated: a one-dimensional .npy file of f32 or f64. Default: at
     /// rest.
     #[arg(long)]
@@ -42,7 +46,7 @@ pub(super) struct Args {
     target: Option<[f64; 3]>,
     /// Up direction of the camera. Default: the scene's up axis.
     #[arg(long, value_parser = parse_point, value_name = "X,Y,Z", allow_hyphen_values = true, requires = "eye")]
-    up: Option<[f64; 3]>,
+    camera_up: Option<[f64; 3]>,
     /// Vertical field of view in degrees. Default: 35.
     #[arg(long, requires = "eye", value_name = "DEGREES")]
     field_of_view: Option<f64>,
@@ -130,7 +134,8 @@ fn mesh_edges(width: Option<f32>, scene: &Scene) -> Result<Option<MeshEdges>> {
 
 pub(super) fn run(args: &Args) -> Outcome {
     let format = FileFormat::of(&args.out)?;
-    let OpenedScene { scene, backends } = with_spinner("loading", || load::open_for_still(&args.scene, args.look))?;
+    let open = || load::open_for_still(&args.scene, args.look, &args.loading.load_options());
+    let OpenedScene { scene, backends } = with_spinner("loading", open)?;
     let mut state = SceneState::rest(&scene);
     if let Some(path) = &args.q {
         state.q = read_coordinates(&scene, path)?;
@@ -192,7 +197,7 @@ fn camera(args: &Args, scene: &Scene) -> Camera {
     let (Some(eye), Some(target)) = (args.eye, args.target) else {
         return Camera::fit_to_scene(scene, args.size.width, args.size.height);
     };
-    let up = args.up.unwrap_or_else(|| scene.up.vector().into());
+    let up = args.camera_up.unwrap_or_else(|| scene.up.vector().into());
     let view = View::LookAt { eye, target, up };
     Camera { view, lens: Lens::FieldOfView(args.field_of_view.unwrap_or(35.0)), near: 0.0, far: 0.0 }
 }

@@ -12,7 +12,7 @@ use crate::config::{BackendChoice, Config, EncodeChoice, ListenAddress, Renderer
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault_in};
-use modalcast_model::load::SceneRepository;
+use modalcast_model::load::{LoadOptions, SceneRepository};
 
 /// Serves scenes over gRPC until SIGTERM or Ctrl-C, then ends open streams and exits.
 #[derive(Debug, clap::Args)]
@@ -40,6 +40,10 @@ pub(super) struct Args {
     /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
+    /// For all scenes, also uploads: treat missing material libraries, materials and images, images of unsupported formats,
+    /// and values that would be corrected or ignored, as errors instead of remarks.
+    #[arg(long)]
+    strict: bool,
     /// Folder for uploads, the list of open scenes and their last steps. Default: the user's XDG state folder.
     #[arg(long, env = "MODALCAST_STATE")]
     state: Option<PathBuf>,
@@ -147,6 +151,7 @@ impl Args {
             viewer: !self.no_viewer,
             viewer_token: self.viewer_token.clone(),
             scenes: self.scenes.clone(),
+            load_options: LoadOptions { is_strict: self.strict, ..LoadOptions::default() },
             state: self.state.clone().unwrap_or(defaults.state),
             backend: self.backend,
             cuda_device: self.cuda_device,
@@ -209,10 +214,10 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
 
 /// Binds the addresses and opens the devices.
 pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)> {
-    let repository = Arc::new(SceneRepository::new(config.scenes.as_deref())?);
+    let repository = SceneRepository::new(config.scenes.as_deref())?.with_options(config.load_options);
     // Bind before scenes are loaded, so that a second server on the same address fails immediately.
     let listener = service::bind(&config).await?;
-    let engine = Engine::start(config, repository).await?;
+    let engine = Engine::start(config, Arc::new(repository)).await?;
     Ok((engine, listener))
 }
 

@@ -8,6 +8,7 @@ use tokio::sync::oneshot;
 
 use super::computed_modes::{self, Computed};
 use super::demo::{ForceFiles, SceneLocation, program_path};
+use super::loading_options::LoadingOptions;
 use super::modeling_options::ModelingOptions;
 use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
@@ -15,6 +16,7 @@ use super::{Completion, Outcome, print_line, recording};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in, invalid};
+use modalcast_model::load::LoadOptions;
 
 /// The program that opens a URL in the user's browser (xdg-utils).
 const URL_OPENER: &str = "xdg-open";
@@ -27,6 +29,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
 #[command(after_help = "Examples:
   modalcast view tree
   modalcast view path/to/simpleBridge --no-sim
+  modalcast view part.stl --unit mm --up y
   modalcast view part.stl --modes 20 --material steel --clamp 'z < 0.01'
   modalcast view fork.npz --slow 500                pulled, and seen in slower motion than by default
   modalcast view tree.mcap                          plays a recording
@@ -60,6 +63,8 @@ pub(super) struct Args {
     /// OpenGL renderer.
     #[arg(long, value_enum, default_value_t)]
     renderer: RendererChoice,
+    #[command(flatten)]
+    loading: LoadingOptions,
     /// Any of these options computes the modes of the model, whose own modes are not used. The result is kept in the
     /// user's cache folder.
     #[command(flatten)]
@@ -70,8 +75,18 @@ impl Args {
     /// The model to show: the given one or, with options of modes, a file with its modes.
     async fn model(&self) -> Result<Computed> {
         match self.modeling.is_requested() {
-            true => computed_modes::compute(&self.model, &self.modeling).await,
+            true => computed_modes::compute(&self.model, &self.loading, &self.modeling).await,
             false => Ok(Computed::File(self.model.clone().into())),
+        }
+    }
+
+    /// The options with which the server opens the shown scene.
+    fn load_options(&self) -> LoadOptions {
+        let options = self.loading.load_options();
+        match self.modeling.is_requested() {
+            // The file with computed modes is in meters, and Z is up.
+            true => LoadOptions { unit: None, up: None, ..options },
+            false => options,
         }
     }
 
@@ -79,6 +94,7 @@ impl Args {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
             scenes: location.repository.clone(),
+            load_options: self.load_options(),
             state: state.to_owned(),
             backend: self.backend,
             renderer: self.renderer,
@@ -131,6 +147,9 @@ pub(super) fn run(args: &Args) -> Outcome {
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().map_err(fault_in("view"))?;
     let result = match recording::is_recording(&args.model) {
         true if args.modeling.is_requested() => Err(invalid("options of modes", "a surface", "a recording")),
+        true if args.loading != LoadingOptions::default() => {
+            Err(invalid("--unit, --up, --strict", "a model", "a recording"))
+        }
         true => runtime.block_on(play(args, args.playback_config(state.path())?)),
         false => runtime.block_on(view_model(args, state.path())),
     };

@@ -218,6 +218,10 @@ impl Engine {
         for remark in scene_handle.scene.remarks.iter().take(MAX_LOGGED_LINES) {
             tracing::warn!(scene = name, remark, "remark of the loader");
         }
+        let remark_count = scene_handle.scene.remarks.len();
+        if remark_count > MAX_LOGGED_LINES {
+            tracing::warn!(scene = name, remarks = remark_count, "only the first remarks are logged");
+        }
         Ok(scene_handle)
     }
 

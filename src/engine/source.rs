@@ -46,7 +46,7 @@ impl SceneSource for SceneRepository {
     }
 
     fn open_upload(&self, upload: &StoredUpload, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
-        Self::open_upload(&upload.folder, &upload.entry, &upload.hashes, memory)
+        self.open_upload(&upload.folder, &upload.entry, &upload.hashes, memory)
     }
 
     fn is_built_in(&self, source: &str) -> bool {

@@ -38,6 +38,93 @@ fn render_prints_the_remarks_that_inspect_prints() {
     assert!(remarks(&rendered)[0].starts_with("remark: not used as modes: pressure.npy"), "{rendered:?}");
 }
 
+/// A box of this size in an OBJ file with a material library that does not exist.
+fn box_without_materials(size: f64) -> String {
+    let mut text = String::from("mtllib absent.mtl\n");
+    for corner in 0..8_u32 {
+        let [x, y, z] = [0, 1, 2].map(|axis| size * f64::from(corner >> axis & 1));
+        text.push_str(&format!("v {x} {y} {z}\n"));
+    }
+    text + "usemtl red\nf 1 3 4 2\nf 5 6 8 7\nf 1 2 6 5\nf 3 7 8 4\nf 1 5 7 3\nf 2 4 8 6\n"
+}
+
+const ON_CPU: [&str; 4] = ["--backend", "cpu", "--renderer", "off"];
+
+#[test]
+fn strict_mode_is_the_same_in_all_commands() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    std::fs::write(folder.path().join("a.obj"), box_without_materials(1.0)).expect("expected a written file");
+    let view = [&["view", "--no-open"], &ON_CPU[..]].concat();
+    let errors: Vec<String> = [&["inspect"][..], &["render", "--out", "a.png"], &view[..]]
+        .into_iter()
+        .map(|command| {
+            let output = run(folder.path(), &[command, &["a.obj", "--strict"]].concat());
+            assert_eq!(output.status.code(), Some(3), "{output:?}");
+            String::from_utf8_lossy(&output.stderr).into_owned()
+        })
+        .collect();
+    for error in &errors {
+        assert!(error.contains("absent.mtl") && error.contains("(strict mode)"), "{error}");
+    }
+    assert!(run(folder.path(), &["inspect", "a.obj"]).status.success(), "control: a remark");
+}
+
+#[test]
+fn unit_and_up_axis_of_the_command_line_are_those_of_the_scene() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    std::fs::write(folder.path().join("a.obj"), box_without_materials(200.0)).expect("expected a written file");
+    let inspect = |options: &[&str]| {
+        let output = run(folder.path(), &[&["inspect", "a.obj"], options].concat());
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8_lossy(&output.stdout).into_owned()
+    };
+    let size_remark = "remark: the scene is 200 x 200 x 200 m; if its file is in millimeters, pass --unit mm";
+    let by_default = inspect(&[]);
+    assert!(by_default.contains("up Y, unit 1 m") && by_default.contains(size_remark), "{by_default}");
+    let in_millimeters = inspect(&["--unit", "mm", "--up", "x"]);
+    assert!(in_millimeters.contains("up X, unit 0.001 m"), "{in_millimeters}");
+    assert!(!in_millimeters.contains("the scene is"), "{in_millimeters}");
+    for (command, message) in [
+        (&["inspect", "a.obj", "--unit", "yard"][..], "expected m, mm, cm"),
+        (&["render", "a.obj", "--out", "a.png", "--up", "0,1,0"][..], "expected x, y or z"),
+        (&["render", "a.obj", "--out", "a.png", "--camera-up", "0,1,0"][..], "--eye"),
+    ] {
+        let output = run(folder.path(), command);
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains(message), "{output:?}");
+    }
+    let recording = folder.path().join("a.mcap");
+    std::fs::write(recording, b"\x89MCAP0\r\n").expect("expected a written file");
+    let output = run(folder.path(), &["view", "a.mcap", "--no-open", "--unit", "mm"]);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("expected a model, got a recording"), "{output:?}");
+}
+
+/// The unit of a file without computed modes is that of the scene. With them, it is that of the surface, and the result
+/// is in meters.
+#[test]
+fn view_with_a_unit_computes_no_modes_unless_they_are_requested() {
+    let folder = folder_with_stand_in();
+    let folder = folder.path();
+    std::fs::write(folder.join("part.obj"), box_without_materials(200.0)).expect("expected a written file");
+    let mut command = Command::new(folder.join("modalcast"));
+    command.current_dir(folder).args(["view", "part.obj", "--unit", "mm", "--up", "x", "--no-open", "--no-sim"]);
+    let mut view = command.args(ON_CPU).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().expect("a process");
+    let lines = BufReader::new(view.stdout.take().expect("expected an output")).lines();
+    assert!(lines.map_while(Result::ok).any(|line| line.starts_with("open http://")), "expected an open scene");
+    kill_process(Pid::from_child(&view), Signal::TERM).expect("expected a running server");
+    let mut log = String::new();
+    view.stderr.take().expect("expected a log").read_to_string(&mut log).expect("expected text");
+    assert!(view.wait().expect("expected the end of the server").success());
+    assert!(!folder.join("runs").exists(), "no modes");
+    assert!(log.contains("absent.mtl") && !log.contains("the scene is 200"), "{log}");
+
+    let mut command = view_command(folder, "steel");
+    let output =
+        command.args(["--unit", "mm", "--up", "x", "--strict"]).output().expect("expected the program to start");
+    let log = String::from_utf8_lossy(&output.stderr);
+    assert!(log.starts_with("modes of --progress=auto --unit=mm --up=x --strict --material=steel"), "{log}");
+}
+
 #[test]
 fn view_rejects_what_it_cannot_open_before_it_prints_an_address() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");

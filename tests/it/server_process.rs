@@ -126,6 +126,31 @@ fn threads_share_few_arenas_of_the_allocator() {
     assert!(many.arenas() > cores, "negative control: {} arenas", many.arenas());
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn strict_server_refuses_what_a_remark_would_report() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let scenes = folder.path().join("scenes");
+    std::fs::create_dir_all(&scenes).expect("expected a folder");
+    let text = "mtllib absent.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+    std::fs::write(scenes.join("a.obj"), text).expect("expected a written file");
+    for options in [&[][..], &["--strict"]] {
+        let server = ServerProcess::start_with(folder.path(), options);
+        let client = server.client().await;
+        let opened = client.open_scene("a.obj", "opened").await;
+        let uploaded = client.upload_scene(&scenes.join("a.obj"), "uploaded", "a.obj").await;
+        for result in [opened, uploaded] {
+            match (result, options.is_empty()) {
+                (Ok(info), true) => {
+                    assert!(info.remarks.iter().any(|remark| remark.contains("absent.mtl")), "{:?}", info.remarks);
+                    client.delete_scene(&info.scene).await.expect("expected a deleted scene");
+                }
+                (Err(error), false) => assert!(error.to_string().contains("(strict mode)"), "{error}"),
+                (result, _) => panic!("{options:?}: {result:?}"),
+            }
+        }
+    }
+}
+
 /// Number of clients that never read, for each kind of stream.
 const STALLED_READERS: u64 = 16;
 

@@ -107,7 +107,7 @@ pub(crate) fn far_strips() -> Arc<Scene> {
         shapes,
         materials,
         domains,
-        unit: 0.5,
+        unit: Some(0.5),
         origin: [1e7, -1e7, 1e7 + 0.25],
         ..SceneParts::named("far")
     };

@@ -76,7 +76,7 @@ impl Body {
     /// `Invalid` if the surface has no area or no volume, or a clamp or material is wrong.
     pub fn new(file: &SurfaceFile, parameters: &ModelingParameters) -> Result<Self> {
         let mesh = &file.mesh;
-        let unit = parameters.unit.meters;
+        let unit = parameters.unit.meters();
         let mut surface = Surface::new(&mesh.positions, &mesh.triangles, &mesh.triangle_groups);
         if surface.area() <= 0.0 {
             return Err(invalid("surface", "at least one triangle with an area", "none"));

@@ -21,7 +21,7 @@ use crate::surface_file::SurfaceFile;
 /// # Errors
 /// `Fault` if an array has the wrong size.
 pub fn encode(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modeling) -> Result<Vec<u8>> {
-    let up_axis = parameters.up_axis.unwrap_or(file.up_axis);
+    let up_axis = file.up_axis;
     let mesh = &modeling.mesh;
     let (vertices, rank, faces) = (mesh.positions.len(), modeling.eigenvalues.len(), mesh.triangles.len());
     let mut archive = Archive::new();
@@ -97,7 +97,7 @@ fn notes(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modelin
         ("rigid_modes", "0".into()),
         ("modes.source", file.name.clone()),
         ("modes.source_sha256", file.sha256.clone()),
-        ("modes.unit", parameters.unit.name.into()),
+        ("modes.unit", parameters.unit.to_string()),
         ("modes.material", describe),
         ("modes.mass", format!("{:.6e}", modeling.mass)),
         ("modes.free_rigid_modes", modeling.rigid_modes.to_string()),

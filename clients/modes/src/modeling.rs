@@ -370,7 +370,7 @@ fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, mo
     }
     let diagonal = body.diagonal();
     if !(1e-3..=100.0).contains(&diagonal) {
-        let unit = parameters.unit.name;
+        let unit = parameters.unit;
         remarks.push(format!("the part measures {diagonal:.3e} m from corner to corner; is '{unit}' its --unit?"));
     }
     for material in &body.materials {

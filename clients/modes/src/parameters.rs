@@ -1,6 +1,7 @@
 //! Parameters of a computation: modes, materials, units and constraints.
 
 use modalcast_model::error::{Result, invalid};
+use modalcast_model::scene::LengthUnit;
 use nalgebra::Vector3;
 
 use crate::materials::Material;
@@ -21,21 +22,13 @@ pub struct ModelingParameters {
     pub group_materials: Vec<(String, Material)>,
     /// Replaces the damping ratio of the material.
     pub damping_ratio: Option<f64>,
-    pub unit: Unit,
-    /// The axis of the file that points up. `None` is that of the file's format.
-    pub up_axis: Option<usize>,
+    /// The unit of the file.
+    pub unit: LengthUnit,
     /// Regions that are held (see [`crate::region::Region::parse`]).
     pub clamps: Vec<String>,
     pub point_masses: Vec<PointMass>,
     /// The thickness of a sheet.
     pub thickness: Option<f64>,
-}
-
-/// A unit of length.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Unit {
-    pub name: &'static str,
-    pub meters: f64,
 }
 
 /// A mass without extent.
@@ -56,15 +49,6 @@ const FREEDOM_LIMITS: std::ops::RangeInclusive<usize> = 300..=1_000_000;
 /// Limit on the modes of a domain.
 const MAX_MODES: usize = 512;
 
-const UNITS: [Unit; 6] = [
-    Unit { name: "m", meters: 1.0 },
-    Unit { name: "mm", meters: 1e-3 },
-    Unit { name: "cm", meters: 1e-2 },
-    Unit { name: "um", meters: 1e-6 },
-    Unit { name: "in", meters: 0.0254 },
-    Unit { name: "ft", meters: 0.3048 },
-];
-
 impl Default for ModelingParameters {
     fn default() -> Self {
         let steel = Material {
@@ -81,8 +65,7 @@ impl Default for ModelingParameters {
             material: steel,
             group_materials: Vec::new(),
             damping_ratio: None,
-            unit: UNITS[0],
-            up_axis: None,
+            unit: LengthUnit::METER,
             clamps: Vec::new(),
             point_masses: Vec::new(),
             thickness: None,
@@ -143,17 +126,6 @@ impl ModelingParameters {
     }
 }
 
-impl Unit {
-    /// Reads the name of a unit.
-    ///
-    /// # Errors
-    /// `Invalid` with the known units.
-    pub fn parse(name: &str) -> Result<Self> {
-        let expected = || UNITS.map(|unit| unit.name).join(", ");
-        UNITS.into_iter().find(|unit| unit.name == name).ok_or_else(|| invalid("--unit", expected(), name))
-    }
-}
-
 impl PointMass {
     /// Reads `X Y Z KG`.
     ///
@@ -169,15 +141,6 @@ impl PointMass {
             _ => Err(invalid("--point-mass", "'X Y Z KG' with a mass above 0", format!("'{text}'"))),
         }
     }
-}
-
-/// Reads the name of an axis.
-///
-/// # Errors
-/// `Invalid` unless the name is x, y or z.
-pub fn parse_axis(name: &str) -> Result<usize> {
-    let index = ["x", "y", "z"].iter().position(|axis| axis.eq_ignore_ascii_case(name));
-    index.ok_or_else(|| invalid("--up", "x, y or z", name))
 }
 
 #[cfg(test)]
@@ -202,11 +165,9 @@ mod tests {
             let error = parameters.validated().expect_err("expected an error").to_string();
             assert!(error.starts_with(message), "{error}");
         }
-        assert!(Unit::parse("yard").expect_err("an error").to_string().contains("m, mm, cm, um, in, ft"));
         assert!(PointMass::parse("1 2 3").is_err() && PointMass::parse("1 2 3 -1").is_err());
         assert!(PointMass::parse("1 foo 2 3 4").is_err() && PointMass::parse("0,5 0 1").is_err());
         assert_eq!(PointMass::parse("-1 0 2 0.5").expect("a mass").mass, 0.5);
-        assert!(parse_axis("w").is_err() && parse_axis("Y").is_ok_and(|axis| axis == 1));
     }
 
     #[test]

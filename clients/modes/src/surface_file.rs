@@ -7,8 +7,8 @@ use std::path::Path;
 
 use modalcast_model::domain::Material;
 use modalcast_model::error::{Result, invalid};
-use modalcast_model::load;
-use modalcast_model::scene::{Scene, UpAxis};
+use modalcast_model::load::{self, LoadOptions};
+use modalcast_model::scene::Scene;
 use nalgebra::Vector3;
 use sha2::{Digest as _, Sha256};
 
@@ -35,7 +35,7 @@ pub struct SurfaceFile {
     pub name: String,
     /// SHA-256 of the file, hexadecimal.
     pub sha256: String,
-    /// The axis of the file that points up: 1 for y, 2 for z.
+    /// The axis of the file that points up: 0 for x, 1 for y, 2 for z.
     pub up_axis: usize,
     pub mesh: DrawnMesh,
     /// Names of the groups: materials or objects of the file. A file with one group and several shells has the groups
@@ -45,25 +45,25 @@ pub struct SurfaceFile {
     pub remarks: Vec<String>,
 }
 
-/// Reads a model file. `unit` is the number of meters per unit of the file.
+/// Reads a model file.
 ///
 /// # Errors
 /// Those of the loaders; `Invalid` for scenes that are not a file.
-pub fn read(path: &str, unit: f64) -> Result<SurfaceFile> {
+pub fn read(path: &str, options: &LoadOptions) -> Result<SurfaceFile> {
     let file_path = Path::new(path);
     if !file_path.is_file() {
         return Err(invalid(format!("file '{path}'"), "an existing model file", "none of this name"));
     }
-    let opened = load::open_without_modes(path)?;
+    let opened = load::open_without_modes(path, options)?;
     let mut file = SurfaceFile {
         name: file_path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default(),
         sha256: hash_file(file_path).map_err(|error| invalid(format!("file '{path}'"), "a readable file", error))?,
-        up_axis: if opened.up == UpAxis::Y { 1 } else { 2 },
+        up_axis: opened.up.index(),
         remarks: opened.remarks.clone(),
         ..SurfaceFile::default()
     };
     for domain in 0..opened.domains.len() {
-        add_domain(&opened, domain, unit * opened.unit, &mut file);
+        add_domain(&opened, domain, opened.unit, &mut file);
     }
     if file.groups.len() == 1 {
         name_shells(&mut file);
@@ -178,7 +178,8 @@ mod tests {
         let text = "mtllib part.mtl\nv 0 0 0\nv 10 0 0\nv 0 10 0\nv 0 0 10\n\
                     usemtl red\nf 1 3 2\nf 1 2 4\nusemtl blue\nf 1 4 3\nf 2 3 4\n";
         std::fs::write(&path, text).expect("a file");
-        let file = read(&path.to_string_lossy(), 0.001).expect("a surface");
+        let options = LoadOptions { unit: Some("mm".parse().expect("a unit")), ..LoadOptions::default() };
+        let file = read(&path.to_string_lossy(), &options).expect("a surface");
         assert_eq!(file.groups, ["red", "blue"]);
         assert_eq!(file.mesh.triangle_groups, [0, 0, 1, 1]);
         assert!((file.mesh.positions[1] - Vector3::new(0.01, 0.0, 0.0)).norm() < 1e-9);
@@ -201,14 +202,14 @@ mod tests {
         text.push_str("f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n");
         text.push_str("f 6 7 9\nf 6 9 8\nf 7 8 9\nf 6 10 7\nf 6 8 10\nf 7 10 8\n");
         std::fs::write(&path, text).expect("a file");
-        let file = read(&path.to_string_lossy(), 1.0).expect("a surface");
+        let file = read(&path.to_string_lossy(), &LoadOptions::default()).expect("a surface");
         assert_eq!(file.groups, ["shell 1", "shell 2"]);
         assert_eq!(file.mesh.triangle_groups, [1, 1, 1, 1, 0, 0, 0, 0, 0, 0]);
     }
 
     #[test]
     fn missing_file_is_an_error() {
-        let error = read("missing.stl", 1.0).expect_err("expected an error").to_string();
+        let error = read("missing.stl", &LoadOptions::default()).expect_err("expected an error").to_string();
         assert!(error.contains("missing.stl"), "{error}");
     }
 }

@@ -110,6 +110,16 @@ fn y_up_surface_becomes_a_z_up_model() {
 }
 
 #[test]
+fn strict_mode_refuses_surfaces_with_missing_files() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let text = "mtllib absent.mtl\nv 0 0 0\nv 1 0 0\nv 0 3 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+    std::fs::write(folder.path().join("a.obj"), text).expect("expected a writable file");
+    let arguments = ["a.obj", "--freedoms", "1500", "--modes", "4"];
+    assert!(error_of(&run(folder.path(), &[&arguments[..], &["--strict"]].concat())).contains("absent.mtl"));
+    assert!(run(folder.path(), &arguments).status.success(), "control");
+}
+
+#[test]
 fn errors_name_what_is_wrong_and_leave_no_file() {
     let folder = tempfile::tempdir().expect("expected a folder");
     write_stl(folder.path(), "box.stl", &solid_box([1.0, 0.7, 0.4]), 1.0);
@@ -122,7 +132,6 @@ fn errors_name_what_is_wrong_and_leave_no_file() {
         ("nan.obj", "finite"),
         ("flat.obj", "--thickness"),
         ("box.stl --material E=1e9,nu=0.5,rho=1000", "below 0.5, got 0.5"),
-        ("box.stl --unit yard", "m, mm, cm"),
         ("box.stl --clamp z<-9", "touches the body"),
         ("box.stl --clamp h<1", "x, y and z"),
         ("box.stl --modes 0", "1 to 512"),

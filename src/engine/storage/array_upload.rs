@@ -225,7 +225,7 @@ impl ArrayUpload {
 
     /// The up axis of the scene and of its meshes in `scene.toml`.
     const fn up(&self) -> &'static str {
-        ["x", "y", "z"][self.header.up.index()]
+        self.header.up.name()
     }
 
     /// Number of domains so far.

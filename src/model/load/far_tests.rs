@@ -8,6 +8,7 @@ use nalgebra::Vector3;
 use ndarray::Array2;
 use zip::CompressionMethod;
 
+use super::LoadOptions;
 use super::asset_dir::AssetDir;
 use super::modes::test_archives::{archive, npy};
 use super::source;
@@ -117,7 +118,7 @@ fn gltf(center: [f64; 3]) -> Vec<u8> {
 
 /// Loads a file of a folder.
 fn load(folder: &Path, name: &str) -> std::sync::Arc<Scene> {
-    let description = source::read(&AssetDir::unrestricted(folder), name).expect(name);
+    let description = source::read(&AssetDir::unrestricted(folder), name, &LoadOptions::default()).expect(name);
     Scene::new(description.parts).expect(name)
 }
 

@@ -13,7 +13,8 @@
 //! - Texture coordinates have (0, 0) at the top left of the image; OBJ's v is flipped.
 //! - Colors in files are linear factors. Color images are sRGB; normal maps are linear with +Y up.
 //! - OBJ and glTF have Y up; plants, PLY, STL and NumPy archives have Z up; units are meters. `scene.toml` can override
-//!   these defaults.
+//!   these defaults, and [`LoadOptions`] override both. A remark names the size of a scene that is implausible in meters,
+//!   if neither the format nor the user gives the unit.
 //! - Normals of a file are kept. Missing normals are smooth except along creases, which split the corners of a vertex
 //!   but not the vertex itself (module `domain::creases`).
 //! - Positions are read as f64. A mesh that is far from the origin of its file, in terms of its own size, is centered
@@ -46,6 +47,7 @@ mod plant;
 mod ply;
 mod polygons;
 mod repository;
+mod size;
 mod source;
 mod stl;
 mod surface;
@@ -62,9 +64,36 @@ pub use source::is_built_in;
 use std::path::Path;
 use std::sync::Arc;
 
+use asset_dir::AssetDir;
+
 use crate::backend_settings::BackendSettings;
 use crate::error::Result;
-use crate::scene::{LookPreset, PresetRequest, RenderSettings, Scene, SceneParts};
+use crate::scene::{LengthUnit, LookPreset, PresetRequest, RenderSettings, Scene, SceneParts, UpAxis};
+
+/// How the files of a scene are read.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct LoadOptions {
+    /// Whether missing files and definitions, images of other formats, and values that would be corrected or ignored are
+    /// errors instead of remarks.
+    pub is_strict: bool,
+    /// Replaces the unit of the file format or of `scene.toml`.
+    pub unit: Option<LengthUnit>,
+    /// Replaces the up axis of the file format or of `scene.toml`.
+    pub up: Option<UpAxis>,
+}
+
+impl LoadOptions {
+    /// The folder from which the loaders read.
+    fn apply_to_folder(&self, files: &AssetDir) -> AssetDir {
+        if self.is_strict { files.strict() } else { files.clone() }
+    }
+
+    /// Sets the unit and the up axis of a model that is opened without `scene.toml`.
+    fn apply_to_model(&self, parts: &mut SceneParts) {
+        parts.unit = self.unit.map(LengthUnit::meters).or(parts.unit);
+        parts.up = self.up.unwrap_or(parts.up);
+    }
+}
 
 /// A scene that was opened by name or path, with its backend settings.
 #[derive(Debug, Clone)]
@@ -78,7 +107,14 @@ impl OpenedScene {
     /// # Errors
     /// Those of [`Scene::new`].
     fn new(SceneDescription { parts, backends }: SceneDescription) -> Result<Self> {
-        Ok(Self { scene: Scene::new(parts)?, backends })
+        let is_unit_known = parts.unit.is_some();
+        let mut scene = Scene::new(parts)?;
+        // A new scene is not shared.
+        if let Some(scene) = Arc::get_mut(&mut scene).filter(|_| !is_unit_known) {
+            let remark = size::implausible_size(scene);
+            scene.remarks.extend(remark);
+        }
+        Ok(Self { scene, backends })
     }
 }
 
@@ -110,17 +146,30 @@ impl From<SceneParts> for SceneDescription {
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
 pub fn open(source: &str) -> Result<OpenedScene> {
-    OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?)
+    open_with(source, &LoadOptions::default())
 }
 
-/// As [`open`], for a still picture: `preset` replaces the scene's own preset. A scene without a preset is drawn as by
+/// As [`open`], with options.
+///
+/// # Errors
+/// As for [`open`]; in strict mode, also for content that otherwise causes a remark.
+pub fn open_with(source: &str, options: &LoadOptions) -> Result<OpenedScene> {
+    OpenedScene::new(source::read(&working_folder(), source, options)?)
+}
+
+/// The folder to which paths on the command line are relative.
+fn working_folder() -> AssetDir {
+    AssetDir::unrestricted(Path::new("."))
+}
+
+/// As [`open_with`], for a still picture: `preset` replaces the scene's own preset. A scene without a preset is drawn as by
 /// a GPU on every machine, because the time of a single picture does not matter. Settings of antialiasing and shadow
 /// map in `scene.toml` win over both.
 ///
 /// # Errors
-/// As for [`open`].
-pub fn open_for_still(source: &str, preset: Option<LookPreset>) -> Result<OpenedScene> {
-    let mut description = source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")), source)?;
+/// As for [`open_with`].
+pub fn open_for_still(source: &str, preset: Option<LookPreset>, options: &LoadOptions) -> Result<OpenedScene> {
+    let mut description = source::read(&working_folder(), source, options)?;
     let look = &mut description.parts.look;
     let request = look.preset.unwrap_or_default();
     let preset = preset.or(request.preset);
@@ -130,21 +179,16 @@ pub fn open_for_still(source: &str, preset: Option<LookPreset>) -> Result<Opened
     OpenedScene::new(description)
 }
 
-/// As [`open`], but missing material libraries, materials and images are errors instead of remarks.
+/// As [`open_with`] for a model file, but without modes: neither those of the file nor those of a file beside it are
+/// read. There is no remark on the size.
 ///
 /// # Errors
-/// As for [`open`].
-pub fn open_strict(source: &str) -> Result<OpenedScene> {
-    OpenedScene::new(source::read(&asset_dir::AssetDir::unrestricted(Path::new(".")).strict(), source)?)
-}
-
-/// As [`open`] for a model file, but without modes: neither those of the file nor those of a file beside it are read.
-///
-/// # Errors
-/// As for [`open`].
-pub fn open_without_modes(source: &str) -> Result<Arc<Scene>> {
-    let options = surface::ModelOptions { modes: surface::ModesSource::None, ..Default::default() };
-    Scene::new(source::read_model(&asset_dir::AssetDir::unrestricted(Path::new(".")), source, options)?)
+/// As for [`open_with`].
+pub fn open_without_modes(source: &str, options: &LoadOptions) -> Result<Arc<Scene>> {
+    let model_options = surface::ModelOptions { modes: surface::ModesSource::None, ..Default::default() };
+    let mut parts = source::read_model(&options.apply_to_folder(&working_folder()), source, model_options)?;
+    options.apply_to_model(&mut parts);
+    Scene::new(parts)
 }
 
 /// The files with the modes of a scene, each with its number of columns: `FILE (r = 20)`, without repetitions, in the
@@ -175,7 +219,7 @@ mod tests {
         let look_of = |manifest: &str, preset: Option<LookPreset>| {
             let path = folder.path().join("scene.toml");
             std::fs::write(&path, format!("model = 'a.obj'\n{manifest}")).expect("a writable file");
-            open_for_still(&path.to_string_lossy(), preset).expect("a scene").scene.look
+            open_for_still(&path.to_string_lossy(), preset, &LoadOptions::default()).expect("a scene").scene.look
         };
         let preset_of = |manifest: &str, preset| look_of(manifest, preset).preset.and_then(|request| request.preset);
         assert_eq!(preset_of("look = 'preview'\n", None), Some(LookPreset::Preview));

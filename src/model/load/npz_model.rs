@@ -60,6 +60,8 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let model =
         parse(files, &content, &mut parts.remarks).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;
     parts.materials = model.materials;
+    // The program that computes modes writes the unit of its surface as a note, and lengths in meters.
+    parts.unit = model.notes.contains_key("modes.unit").then_some(1.0);
     surface::add_domain(files, name, &model.polygons, options, model.modes, &mut parts)?;
     for domain in &mut parts.domains {
         let notes = model.notes.clone();

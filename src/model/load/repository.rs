@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use super::asset_dir::{AssetDir, EntryKind};
 use super::file_hashes::FileHashes;
-use super::{OpenedScene, manifest, source};
+use super::{LoadOptions, OpenedScene, manifest, source};
 use crate::error::{Error, Result};
 use crate::memory::MemoryReservation;
 
@@ -19,6 +19,7 @@ const MAX_LISTED_NAMES: usize = 4096;
 pub struct SceneRepository {
     /// The canonical path of the folder. `None`: the repository has only the built-in scenes.
     root: Option<PathBuf>,
+    options: LoadOptions,
 }
 
 impl SceneRepository {
@@ -27,7 +28,14 @@ impl SceneRepository {
     /// # Errors
     /// `Unavailable` if the folder does not exist.
     pub fn new(root: Option<&Path>) -> Result<Self> {
-        Ok(Self { root: root.map(canonical_folder).transpose()? })
+        Ok(Self { root: root.map(canonical_folder).transpose()?, options: LoadOptions::default() })
+    }
+
+    /// The same repository, whose scenes are read with these options. Only [`LoadOptions::is_strict`] also applies to
+    /// uploads, because they come from other programs, which set the unit and the up axis themselves.
+    #[must_use]
+    pub fn with_options(self, options: LoadOptions) -> Self {
+        Self { options, ..self }
     }
 
     /// Opens a built-in scene or a path inside the repository; `.` is the repository's root folder. The loaders reserve
@@ -37,8 +45,8 @@ impl SceneRepository {
     /// As for [`super::open`], `Invalid` for a path that leaves the repository, and `OutOfMemory`.
     pub fn open(&self, source: &str, memory: &Arc<MemoryReservation>) -> Result<OpenedScene> {
         match &self.root {
-            Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root, memory), source)?),
-            None if source::is_built_in(source) => super::open(source),
+            Some(root) => OpenedScene::new(source::read(&AssetDir::confined_to(root, memory), source, &self.options)?),
+            None if source::is_built_in(source) => super::open_with(source, &self.options),
             None => Err(Error::NotFound { what: "scene", given: source.into() }),
         }
     }
@@ -49,6 +57,7 @@ impl SceneRepository {
     /// # Errors
     /// As for [`Self::open`], and `Invalid` with the name of a file that has changed.
     pub fn open_upload(
+        &self,
         folder: &Path,
         entry: &str,
         hashes: &Arc<FileHashes>,
@@ -56,7 +65,8 @@ impl SceneRepository {
     ) -> Result<OpenedScene> {
         let files = AssetDir::confined_to(&canonical_folder(folder)?, memory).with_hashes(Arc::clone(hashes));
         // With the leading "./" a file name is never resolved as a built-in name.
-        OpenedScene::new(source::read(&files, &format!("./{entry}"))?)
+        let options = LoadOptions { is_strict: self.options.is_strict, ..LoadOptions::default() };
+        OpenedScene::new(source::read(&files, &format!("./{entry}"), &options)?)
     }
 
     /// Whether a source names a built-in scene.
@@ -126,6 +136,8 @@ fn collect_names(folder: &AssetDir, prefix: &str, depth: usize, names: &mut Vec<
 
 #[cfg(test)]
 mod tests {
+    use sha2::Digest as _;
+
     use super::*;
 
     const TRIANGLE: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
@@ -231,6 +243,33 @@ mod tests {
             assert_eq!(error, Error::NotFound { what: "scene", given: source.into() });
         }
         assert!(!repository.list().iter().any(|name| name.starts_with("link")));
+    }
+
+    #[test]
+    fn options_apply_to_scenes_and_only_strictness_to_uploads() {
+        let text = format!("mtllib absent.mtl\n{TRIANGLE}");
+        let (outer, lenient) = repository(&[("a.obj", &text), ("b.obj", TRIANGLE)]);
+        let root = outer.path().join("root").canonicalize().expect("a folder");
+        let hash = |text: &str| -> [u8; 32] { sha2::Sha256::digest(text).into() };
+        let hashes: FileHashes =
+            [("a.obj".to_owned(), hash(&text)), ("b.obj".to_owned(), hash(TRIANGLE))].into_iter().collect();
+        let hashes = Arc::new(hashes);
+        let memory = MemoryReservation::unlimited();
+        let unit = Some("mm".parse().expect("a unit"));
+        let options = LoadOptions { is_strict: true, unit, up: Some(crate::scene::UpAxis::Z) };
+        let strict = lenient.clone().with_options(options);
+        let conventions = |opened: OpenedScene| (opened.scene.unit, opened.scene.up.name());
+        assert_eq!(strict.open("b.obj", &memory).map(conventions), Ok((0.001, "z")));
+        assert_eq!(strict.open_upload(&root, "b.obj", &hashes, &memory).map(conventions), Ok((1.0, "y")));
+        assert!(
+            lenient.open("a.obj", &memory).is_ok() && lenient.open_upload(&root, "a.obj", &hashes, &memory).is_ok()
+        );
+        for result in [strict.open("a.obj", &memory), strict.open_upload(&root, "a.obj", &hashes, &memory)] {
+            let message = result.expect_err("strict mode").to_string();
+            assert!(message.contains("absent.mtl"), "{message}");
+        }
+        let built_in = SceneRepository::new(None).expect("built-in scenes").with_options(options);
+        assert_eq!(built_in.open("tree", &memory).map(conventions), Ok((0.001, "z")));
     }
 
     #[test]

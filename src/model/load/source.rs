@@ -4,7 +4,7 @@ use super::asset_dir::{AssetDir, EntryKind, extension_of, file_name_of, parent_o
 use super::conversion::model_hint;
 use super::modes::computed_modes_remark;
 use super::surface::{ModelOptions, ModesSource};
-use super::{SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
+use super::{LoadOptions, SceneDescription, gltf, manifest, npz_model, obj, plant, ply, stl};
 use crate::error::{Error, Result, invalid};
 use crate::scene::SceneParts;
 
@@ -60,28 +60,38 @@ const FORMATS: &str = ".glb, .gltf, .obj, .ply, .stl or .npz";
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
 
-/// Reads a scene of any kind. Only `scene.toml` contains backend settings; other scenes have the defaults.
+/// Reads a scene of any kind. Only `scene.toml` contains backend settings; other scenes have the defaults. Without
+/// `scene.toml` and an option, the unit and the up axis are those of the model.
 ///
 /// # Errors
 /// `NotFound` if nothing has this name; otherwise `Invalid` with the file, the field, and the expected and given value.
-pub(super) fn read(files: &AssetDir, source: &str) -> Result<SceneDescription> {
+pub(super) fn read(files: &AssetDir, source: &str, options: &LoadOptions) -> Result<SceneDescription> {
+    let files = &options.apply_to_folder(files);
+    let read_single_model = || -> Result<SceneDescription> {
+        let mut parts = read_model(files, source, ModelOptions::default())?;
+        options.apply_to_model(&mut parts);
+        Ok(parts.into())
+    };
     if is_built_in(source) {
-        return built_in().map(SceneDescription::from);
+        return read_single_model();
     }
     match files.kind(source)? {
         None => Err(Error::NotFound { what: "scene", given: source.into() }),
         Some(EntryKind::File) if source.ends_with(".toml") => {
             let folder = parent_of(source);
-            manifest::read(&files.within_scene(folder)?, file_name_of(source), &files.resolved_name(folder))
+            let name = files.resolved_name(folder);
+            manifest::read(&files.within_scene(folder)?, file_name_of(source), &name, options)
         }
         Some(EntryKind::Directory) => {
             let folder = files.within_scene(source)?;
             match folder.kind(manifest::MANIFEST_FILE)? {
-                Some(EntryKind::File) => manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source)),
-                _ => read_model(files, source, ModelOptions::default()).map(SceneDescription::from),
+                Some(EntryKind::File) => {
+                    manifest::read(&folder, manifest::MANIFEST_FILE, &files.resolved_name(source), options)
+                }
+                _ => read_single_model(),
             }
         }
-        Some(EntryKind::File) => read_model(files, source, ModelOptions::default()).map(SceneDescription::from),
+        Some(EntryKind::File) => read_single_model(),
     }
 }
 

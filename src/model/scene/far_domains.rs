@@ -95,7 +95,8 @@ fn far_remark(parts: &SceneParts, far_domains: &[(usize, f64)]) -> Option<String
     let (index, reach) = far_domains.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
     let others = far_domains.len() - 1;
     let more = if others > 0 { format!(" and {others} other domains are") } else { " is".to_owned() };
-    let [distance, error] = [*reach, *reach * 2.0_f64.powi(-22)].map(|length| two_digits(length * parts.unit));
+    let [distance, error] =
+        [*reach, *reach * 2.0_f64.powi(-22)].map(|length| two_digits(length * parts.meters_per_unit()));
     Some(format!(
         "'{}'{more} far from the origin ({distance} m): the rest state and f64 poses are exact, but a step with f32 \
          transforms places it with an error of up to {error} m on each axis",

@@ -13,6 +13,7 @@ mod frame_size;
 mod frame_style;
 mod framing;
 mod layout;
+mod length_unit;
 mod light_space;
 mod look_preset;
 mod mesh_edges;
@@ -36,6 +37,7 @@ pub use frame_size::FrameSize;
 pub use frame_style::FrameStyle;
 pub use framing::{CameraSource, Framing};
 pub use layout::{DomainLayout, Layout};
+pub use length_unit::LengthUnit;
 pub use light_space::{OrientedBounds, light_axes};
 pub use look_preset::{FrameAntialiasing, LookOverrides, LookPreset, PresetRequest, RendererKind};
 pub use mesh_edges::MeshEdges;
@@ -88,8 +90,8 @@ pub struct SceneParts {
     pub textures: Vec<Texture>,
     pub domains: Vec<Domain>,
     pub up: UpAxis,
-    /// Meters per scene unit.
-    pub unit: f64,
+    /// Meters per scene unit. `None`: the files do not say, and a unit is taken as a meter.
+    pub unit: Option<f64>,
     /// World position of the scene's origin in meters. Transforms are relative to the scene's origin.
     pub origin: [f64; 3],
     /// Lights, shadow, ground, sky and rasterization: the table `look` of a scene file.
@@ -110,6 +112,7 @@ pub struct Scene {
     pub textures: Vec<Texture>,
     pub domains: Vec<Domain>,
     pub up: UpAxis,
+    /// Meters per scene unit.
     pub unit: f64,
     pub origin: [f64; 3],
     pub look: RenderSettings,
@@ -143,7 +146,7 @@ impl Scene {
             textures: self.textures.clone(),
             domains: self.domains.clone(),
             up: self.up,
-            unit: self.unit,
+            unit: Some(self.unit),
             origin: self.origin,
             look: self.look,
             deformation: self.deformation,
@@ -160,8 +163,9 @@ impl Scene {
         if parts.domains.is_empty() || parts.domains.len() > MAX_DOMAINS {
             return Err(invalid("scene.domains", format!("1 to {MAX_DOMAINS}"), parts.domains.len()));
         }
-        if !(parts.unit.is_finite() && parts.unit > 0.0) {
-            return Err(invalid("scene.unit", "a positive number of meters", parts.unit));
+        let unit = parts.meters_per_unit();
+        if !(unit.is_finite() && unit > 0.0) {
+            return Err(invalid("scene.unit", "a positive number of meters", unit));
         }
         if !parts.origin.iter().all(|number| number.is_finite()) {
             return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
@@ -201,7 +205,7 @@ impl Scene {
             textures: parts.textures,
             domains: parts.domains,
             up: parts.up,
-            unit: parts.unit,
+            unit,
             origin: parts.origin,
             look: parts.look,
             deformation: parts.deformation,
@@ -452,9 +456,14 @@ fn add_smoothing(parts: &mut SceneParts) -> Result<()> {
 }
 
 impl SceneParts {
-    /// Parts without domains, with meters as unit and default settings.
+    /// Parts without domains, with default settings.
     pub fn named(name: impl Into<String>) -> Self {
-        Self { name: name.into(), unit: 1.0, ..Self::default() }
+        Self { name: name.into(), ..Self::default() }
+    }
+
+    /// Meters per scene unit.
+    pub(crate) fn meters_per_unit(&self) -> f64 {
+        self.unit.unwrap_or(1.0)
     }
 
     /// Whether the predicate holds for a material of any domain.

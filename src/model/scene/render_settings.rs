@@ -1,11 +1,13 @@
 //! Render settings of a scene: one directional light (the sun) and its shadow, the ground, the sky, and how triangles
 //! are rasterized and blended.
 
+use std::str::FromStr;
+
 use nalgebra::Vector3;
 
 use super::shadow::ShadowSettings;
 use super::{Antialiasing, Bloom, MeshEdges, PresetRequest, ToneMapping};
-use crate::error::{Result, invalid};
+use crate::error::{Error, Result, invalid};
 
 /// The axis that points up.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, serde::Deserialize)]
@@ -23,6 +25,11 @@ impl UpAxis {
         self as usize
     }
 
+    /// The name in `scene.toml`.
+    pub const fn name(self) -> &'static str {
+        ["x", "y", "z"][self.index()]
+    }
+
     /// The up direction as a unit vector.
     pub fn vector(self) -> Vector3<f64> {
         Vector3::ith(self.index(), 1.0)
@@ -32,6 +39,16 @@ impl UpAxis {
     pub fn rotation_from_y_up(self) -> nalgebra::Rotation3<f64> {
         let identity = nalgebra::Rotation3::identity();
         nalgebra::Rotation3::rotation_between(&Vector3::y(), &self.vector()).unwrap_or(identity)
+    }
+}
+
+/// Parses `x`, `y` or `z`, in either letter case.
+impl FromStr for UpAxis {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        let axis = [Self::X, Self::Y, Self::Z].into_iter().find(|axis| axis.name().eq_ignore_ascii_case(name));
+        axis.ok_or_else(|| invalid("up", "x, y or z", name))
     }
 }
 

@@ -78,7 +78,7 @@ const LEAF_MATERIALS: [(&str, leaf_image::LeafColors); 2] = [
 pub fn generate(parameters: &TreeParameters) -> Result<SceneParts> {
     let mut random = SplitMix64::new(parameters.seed);
     let mut parts = SceneParts::named("tree");
-    parts.rigid_transforms = true;
+    (parts.unit, parts.rigid_transforms) = (Some(1.0), true);
     // Leaves and bark are dark, so strong sunlight does not overexpose them.
     parts.look = RenderSettings {
         sun: [0.52, 0.74, 0.62],

@@ -300,7 +300,7 @@ mod tests {
     #[test]
     fn depth_below_ground_is_exact_above_the_vertex_error() {
         let mut parts = squares(vec![Material::default()]);
-        parts.unit = 0.5;
+        parts.unit = Some(0.5);
         let scene = Scene::new(parts.clone()).expect("a valid scene");
         parts.look.ground = None;
         let without_ground = Scene::new(parts).expect("a valid scene");

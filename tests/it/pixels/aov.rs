@@ -70,7 +70,7 @@ fn depth_is_in_meters_along_the_view_axis() {
     // `unit` is in meters per scene unit.
     for (has_ground, unit) in [(false, 1.0), (true, 0.5)] {
         let mut builder = SceneBuilder::new();
-        builder.parts.unit = unit;
+        builder.parts.unit = Some(unit);
         builder.parts.look.ground = has_ground.then(Ground::default);
         // With a ground, the square is small, so that most pixels show the ground.
         let half_side = if has_ground { 1.0 } else { 40.0 };

@@ -214,6 +214,7 @@ impl GltfAssembler<'_> {
             materials: self.material_converter.materials,
             textures: self.material_converter.texture_loader.textures,
             domains: self.domains,
+            unit: Some(1.0),
             ..SceneParts::named(name)
         };
         if self.has_target_normals {

@@ -15,7 +15,7 @@ use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
 use crate::load::surface::{ModelOptions, ModesSource};
 use crate::load::{modes, source, texture_cache};
-use crate::scene::{MAX_DOMAINS, NormalMethod, PresetRequest, SceneParts, UpAxis};
+use crate::scene::{LengthUnit, MAX_DOMAINS, NormalMethod, PresetRequest, SceneParts, UpAxis};
 
 /// Number of parent vertices that carry the domains of an entry without `parent_vertices`.
 const DEFAULT_ATTACHMENT_VERTICES: usize = 8;
@@ -52,7 +52,7 @@ pub(super) fn assemble(
     assembly.check_override_names()?;
     let mut parts = assembly.parts;
     parts.up = manifest.up.unwrap_or(parts.up);
-    parts.unit = manifest.unit.unwrap_or(parts.unit);
+    parts.unit = manifest.unit.map(LengthUnit::meters).or(parts.unit);
     parts.origin = manifest.origin;
     parts.look = match &manifest.look {
         Some(keys) => keys.render_settings(),

@@ -14,10 +14,10 @@ use patch::MaterialPatch;
 use placement::Placement;
 use settings::{DeformKeys, LookKeys};
 
-use super::SceneDescription;
 use super::asset_dir::AssetDir;
+use super::{LoadOptions, SceneDescription};
 use crate::error::{Result, invalid};
-use crate::scene::UpAxis;
+use crate::scene::{LengthUnit, UpAxis};
 
 /// The file name of a manifest. A folder that contains it is a scene.
 pub(super) const MANIFEST_FILE: &str = "scene.toml";
@@ -30,7 +30,7 @@ const MAX_MANIFEST_BYTES: u64 = 64 << 20;
 struct Manifest {
     name: Option<String>,
     up: Option<UpAxis>,
-    unit: Option<f64>,
+    unit: Option<LengthUnit>,
     #[serde(default)]
     origin: [f64; 3],
     #[serde(default)]
@@ -51,7 +51,7 @@ struct Manifest {
     placement: Option<Placement>,
     eigenvalues: Option<Vec<f64>>,
     notes: Option<BTreeMap<String, String>>,
-    /// Whether missing material libraries, materials and images are errors instead of remarks.
+    /// As [`LoadOptions::is_strict`].
     #[serde(default)]
     strict: bool,
     #[serde(default)]
@@ -94,14 +94,21 @@ struct DomainEntry {
     notes: BTreeMap<String, String>,
 }
 
-/// Reads the manifest `file` in the folder `files`. `default_name` is the name of a scene whose manifest has none.
+/// Reads the manifest `file` in the folder `files`. `default_name` is the name of a scene whose manifest has none. The
+/// unit and the up axis of `options` replace those of the manifest.
 ///
 /// # Errors
 /// `Invalid` with the manifest, the line or entry, and the expected and given value.
-pub(super) fn read(files: &AssetDir, file: &str, default_name: &str) -> Result<SceneDescription> {
+pub(super) fn read(
+    files: &AssetDir,
+    file: &str,
+    default_name: &str,
+    options: &LoadOptions,
+) -> Result<SceneDescription> {
     let location = format!("file '{file}'");
     let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
     let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&location))?;
+    (manifest.unit, manifest.up) = (options.unit.or(manifest.unit), options.up.or(manifest.up));
     let entries = take_entries(&mut manifest).map_err(|error| error.prefix_field(&location))?;
     let files = if manifest.strict { &files.strict() } else { files };
     assemble::assemble(files, &manifest, &entries, default_name).map_err(|error| error.prefix_field(&location))

@@ -131,7 +131,7 @@ fn read_scene(text: &str) -> Result<SceneDescription> {
         write(name, &bytes);
     }
     write(MANIFEST_FILE, text.as_bytes());
-    read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder")
+    read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder", &LoadOptions::default())
 }
 
 #[test]

@@ -31,7 +31,7 @@ fn read_manifest(toml: &str) -> Result<SceneDescription> {
         image.save(folder.path().join(name)).expect("a writable file");
     }
     write(MANIFEST_FILE, toml);
-    read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder")
+    read(&AssetDir::unrestricted(folder.path()), MANIFEST_FILE, "folder", &LoadOptions::default())
 }
 
 fn read_parts(toml: &str) -> Result<SceneParts> {
@@ -50,7 +50,7 @@ fn scene_keys_override_the_defaults() {
          deform = { storage = 'int8', normals = 'exact', displacements = true, batches = 'never' }\n",
     )
     .expect("a valid manifest");
-    assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, 0.01));
+    assert_eq!((parts.name.as_str(), parts.up, parts.unit), ("n", UpAxis::Z, Some(0.01)));
     assert_eq!((parts.origin, parts.rigid_transforms), ([1.5, 0.0, 0.0], true));
     assert!(parts.look.shadow.is_none() && parts.look.ground.is_some());
     assert_eq!(backends, BackendSettings { raster: RasterPolicy::Fastest, batches: BatchPolicy::Never });
@@ -130,7 +130,7 @@ fn folder_is_listed_once_for_all_of_its_models() {
     }
     std::fs::write(folder.path().join(MANIFEST_FILE), toml).expect("a writable file");
     let files = AssetDir::unrestricted(folder.path());
-    read(&files, MANIFEST_FILE, "folder").expect("a valid scene");
+    read(&files, MANIFEST_FILE, "folder", &LoadOptions::default()).expect("a valid scene");
     assert_eq!(files.listing_count(), 1);
 }
 

@@ -37,7 +37,7 @@ pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> R
     let object_ids = object_ids.map_err(|error| error.prefix_field(&file_field(&ids_file)))?;
     let organs = assign_organs(&structure, &positions_by_object(&obj.polygons, &object_ids))
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
-    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem) };
+    let mut parts = SceneParts { up: UpAxis::Z, unit: Some(1.0), ..SceneParts::named(stem) };
     obj::add_materials(&obj, files, &mut parts)?;
     let mut faces_by_organ: HashMap<Organ, Vec<usize>> = HashMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {

@@ -332,7 +332,8 @@ fn build_grove(tree: &Scene) -> SceneParts {
     parts.shapes.clone_from(&tree.shapes);
     parts.materials.clone_from(&tree.materials);
     parts.textures.clone_from(&tree.textures);
-    (parts.look, parts.up, parts.unit, parts.rigid_transforms) = (tree.look, tree.up, tree.unit, tree.rigid_transforms);
+    (parts.look, parts.up) = (tree.look, tree.up);
+    (parts.unit, parts.rigid_transforms) = (Some(tree.unit), tree.rigid_transforms);
     let spacing = 0.42 * tree.rest_bounds.diagonal();
     for (index, [column, row]) in [[-1.5, 0.1], [-0.5, -0.5], [0.5, 0.3], [1.5, -0.3]].into_iter().enumerate() {
         let from_y_up = tree.up.rotation_from_y_up();

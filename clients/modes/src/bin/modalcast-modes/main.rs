@@ -1,6 +1,8 @@
 //! `modalcast-modes`: see `modalcast model --help`.
 
 // `modalcast view` has the same options.
+#[path = "../../../../../src/cli/loading_options.rs"]
+mod loading_options;
 #[path = "../../../../../src/cli/modeling_options.rs"]
 mod modeling_options;
 mod progress;
@@ -14,9 +16,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Parser;
 use modalcast_model::error::{Error, Result, fault_in, invalid};
-use modalcast_modes::parameters::{PointMass, Unit, parse_axis};
+use modalcast_modes::parameters::PointMass;
 use modalcast_modes::{ModelingParameters, compute_modes, model_file, surface_file};
 
+use loading_options::LoadingOptions;
 use modeling_options::ModelingOptions;
 use progress::{ProgressStyle, Reporter};
 
@@ -45,6 +48,8 @@ struct Cli {
     /// The surface of the part.
     #[arg(required_unless_present = "build")]
     model: Option<String>,
+    #[command(flatten)]
+    loading: LoadingOptions,
     #[command(flatten)]
     options: ModelingOptions,
     /// The model to write [default: the name of the surface with the ending .npz, in the working folder].
@@ -90,14 +95,14 @@ const fn exit_code(error: &Error) -> u8 {
 
 fn run(cli: &Cli) -> Result<ExitCode> {
     let Some(model) = &cli.model else { return Ok(ExitCode::SUCCESS) };
-    let parameters = parameters(&cli.options)?;
+    let parameters = parameters(&cli.loading, &cli.options)?;
     if let Some(threads) = cli.options.threads {
         if !(1..=MAX_THREADS).contains(&threads) {
             return Err(invalid("--threads", format!("1 to {MAX_THREADS}"), threads));
         }
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().map_err(fault_in("threads"))?;
     }
-    let file = surface_file::read(model, parameters.unit.meters)?;
+    let file = surface_file::read(model, &cli.loading.load_options())?;
     let out = cli.out.clone().unwrap_or_else(|| PathBuf::from(&file.name).with_extension("npz"));
     let is_source = std::fs::canonicalize(&out).ok().is_some_and(|out| std::fs::canonicalize(model).ok() == Some(out));
     if is_source {
@@ -130,15 +135,14 @@ fn run(cli: &Cli) -> Result<ExitCode> {
 }
 
 /// Reads the strings of the options.
-fn parameters(options: &ModelingOptions) -> Result<ModelingParameters> {
+fn parameters(loading: &LoadingOptions, options: &ModelingOptions) -> Result<ModelingParameters> {
     let default = ModelingParameters::default();
     let mut parameters = ModelingParameters {
         modes: options.modes.unwrap_or(default.modes),
         max_frequency: options.max_frequency,
         freedoms: options.freedoms.unwrap_or(default.freedoms),
         damping_ratio: options.damping,
-        unit: options.unit.as_deref().map_or(Ok(default.unit), Unit::parse)?,
-        up_axis: options.up.as_deref().map(parse_axis).transpose()?,
+        unit: loading.unit.unwrap_or(default.unit),
         clamps: options.clamp.clone(),
         point_masses: options.point_mass.iter().map(|text| PointMass::parse(text)).collect::<Result<_>>()?,
         thickness: options.thickness,

@@ -134,11 +134,15 @@ pub(crate) fn create_progress_bar(count: u64, reply_noun: &'static str) -> Progr
     ProgressBar::new(count).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar())).with_message(reply_noun)
 }
 
-/// Opens the scene if `--open` is given. Returns its name on the server.
+/// Opens the scene if `--open` is given, and prints its remarks on standard error. Returns its name on the server.
 pub(crate) async fn open_scene(client: &Client, options: &SceneOptions) -> Result<String> {
     match &options.open {
         None => Ok(options.scene.clone()),
-        Some(source) => Ok(client.open_scene(source, &options.scene).await?.scene),
+        Some(source) => {
+            let info = client.open_scene(source, &options.scene).await?;
+            info.remarks.iter().for_each(|remark| eprintln!("modalcast-fetch: {}: {remark}", info.scene));
+            Ok(info.scene)
+        }
     }
 }
 
