@@ -18,6 +18,8 @@ use crate::scene::SceneParts;
 
 /// The largest number of material names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
+/// What is drawn without a material library, for a remark.
+const MISSING_LIBRARY: &str = "the default color is drawn for its materials";
 /// The largest number of names of undefined materials in a remark.
 const MAX_LISTED_UNDEFINED: usize = 8;
 
@@ -63,11 +65,15 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
 pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut SceneParts) -> Result<()> {
     let mut texture_cache = TextureCache::default();
     let mut statements_by_name = BTreeMap::new();
+    let mut has_all_libraries = true;
     for library in &obj.libraries {
         for reference in library_references(files, library) {
             let subject = format!("material library '{reference}'");
-            let path = files.find_referenced(reference, &subject, "it is left out", &mut parts.remarks)?;
-            let Some(path) = path else { continue };
+            let path = files.find_referenced(reference, &subject, MISSING_LIBRARY, &mut parts.remarks)?;
+            let Some(path) = path else {
+                has_all_libraries = false;
+                continue;
+            };
             let library_statements = mtl::parse(&files.read(&path, MAX_TEXT_BYTES)?);
             let library_statements =
                 library_statements.map_err(|error| error.prefix_field(&format!("file '{path}'")))?;
@@ -99,7 +105,8 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
         };
         parts.materials.push(material);
     }
-    if !undefined_names.is_empty() {
+    // The remark on a missing library says enough.
+    if has_all_libraries && !undefined_names.is_empty() {
         let undefined_count = undefined_names.len();
         undefined_names.truncate(MAX_LISTED_UNDEFINED);
         parts.remarks.push(format!(
@@ -193,8 +200,8 @@ mod tests {
         let files = AssetDir::unrestricted(folder.path());
         let read = |name: &str| read(&files, name, ModelOptions::default()).expect("a mesh with stand-ins");
         let lib = read("lib.obj");
-        let undefined = "undefined materials have the default color (1): 'bark'";
-        assert_eq!(lib.remarks, ["material library 'no.mtl' does not exist: it is left out", undefined]);
+        let stand_in = "the default color is drawn for its materials";
+        assert_eq!(lib.remarks, [format!("material library 'no.mtl' does not exist: {stand_in}")]);
         assert_eq!(lib.materials[0], Material::unspecified("bark"));
         assert_eq!(read("use.obj").remarks, ["undefined materials have the default color (1): 'green'"]);
         let map = read("map.obj");
@@ -223,15 +230,18 @@ mod tests {
         for (statement, remarks) in [
             ("a.mtl b.mtl", vec![]),
             ("my library.mtl", vec![]),
-            ("a.mtl no.mtl", vec!["'no.mtl' does not exist: it is left out"]),
-            ("no library.mtl", vec!["'no library.mtl' does not exist: it is left out"]),
+            ("a.mtl no.mtl", vec!["'no.mtl' does not exist: the default color is drawn for its materials"]),
+            ("no library.mtl", vec!["'no library.mtl' does not exist: the default color is drawn for its materials"]),
             ("My Library.mtl", vec!["'My Library.mtl' does not exist: 'my library.mtl' is read"]),
             (
                 "C:\\my files\\a.mtl",
                 vec!["'C:\\my files\\a.mtl' is outside of the folder of the scene: 'a.mtl' is read"],
             ),
             ("../a.mtl", vec!["'../a.mtl' is outside of the folder of the scene: 'a.mtl' is read"]),
-            ("../no.mtl", vec!["'../no.mtl' is outside of the folder of the scene: it is left out"]),
+            (
+                "../no.mtl",
+                vec!["'../no.mtl' is outside of the folder of the scene: the default color is drawn for its materials"],
+            ),
         ] {
             let text = format!("mtllib {statement}\n{TRIANGLE}f 1 2 3\n");
             let obj = ObjFile::parse(text.as_bytes(), None).expect(statement);
