@@ -29,6 +29,9 @@ const APPEARANCE_PREFIXES: [&str; 7] = [
     "KHR_animation_pointer",
 ];
 
+/// Extensions with hints for editors, without which nothing differs. They need no remark.
+const HINTS: [&str; 1] = ["FB_ngon_encoding"];
+
 /// Checks the required extensions, and adds a remark for each extension that is not read. `name` is the name of the file.
 ///
 /// # Errors
@@ -59,7 +62,7 @@ pub(super) fn check(document: &Document, is_strict: bool, name: &str, remarks: &
         }
     }
     for extension in document.extensions_used.iter().chain(&document.extensions_required) {
-        if !SUPPORTED.contains(&extension.as_str()) {
+        if !SUPPORTED.contains(&extension.as_str()) && !HINTS.contains(&extension.as_str()) {
             remarks.add(format!("the extension {extension} is not supported: ignored"));
         }
     }
