@@ -37,6 +37,7 @@ impl PlyHeader {
             let expected = format!("ply, and end_header within {MAX_HEADER_BYTES} bytes");
             return Err(invalid("header", expected, format!("{} bytes without them", bytes.len())));
         };
+        check_keywords(&text)?;
         let header = Parser::<DefaultElement>::new().read_header(&mut Reader::new(text.as_bytes()));
         let header = header.map_err(|error| invalid("header", "a PLY header", quote(error.to_string().as_bytes())))?;
         check_repetitions(text.as_bytes(), &header.elements)?;
@@ -127,12 +128,13 @@ fn split_header(bytes: &[u8]) -> Option<(String, &[u8])> {
         let is_comment = decoded.trim_start().starts_with("comment");
         let words = decoded.splitn(if is_comment { 2 } else { usize::MAX }, [' ', '\t']);
         let words = words.map(str::trim).filter(|word| !word.is_empty());
-        let line = words.collect::<Vec<_>>().join(" ");
+        let mut line = words.collect::<Vec<_>>().join(" ");
         if text.is_empty() {
             has_cr_lf = line_end.starts_with(b"\r\n");
-            if line != "ply" {
+            if !line.eq_ignore_ascii_case("ply") {
                 return None;
             }
+            line.make_ascii_lowercase();
         }
         text.push_str(&line);
         text.push('\n');
@@ -143,6 +145,20 @@ fn split_header(bytes: &[u8]) -> Option<(String, &[u8])> {
             return Some((text, &bytes[bytes.len().min(MAX_HEADER_BYTES) - rest.len()..]));
         }
         length?;
+    }
+}
+
+/// Rejects lines that are no statements, because the parser does not say what is wrong with them.
+fn check_keywords(header: &str) -> Result<()> {
+    const KEYWORDS: [&str; 7] = ["ply", "format", "comment", "obj_info", "element", "property", "end_header"];
+    let is_statement = |line: &str| line.is_empty() || KEYWORDS.contains(&line.split(' ').next().unwrap_or_default());
+    match header.lines().enumerate().find(|(_, line)| !is_statement(line)) {
+        None => Ok(()),
+        Some((index, line)) => Err(invalid(
+            format!("header: line {}", index + 1),
+            "format, comment, obj_info, element, property or end_header",
+            quote(line.as_bytes()),
+        )),
     }
 }
 

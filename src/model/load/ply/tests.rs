@@ -210,6 +210,14 @@ fn truncated_files_are_rejected() {
 }
 
 #[test]
+fn magic_number_has_any_letter_case() {
+    let upper_case = ascii().replacen("ply", "PLY", 1);
+    let ply = parse(upper_case.as_bytes()).expect("a valid file");
+    assert_eq!(ply.polygons.positions, POSITIONS.map(|position| position.map(f64::from)));
+    assert!(parse(ascii().replacen("ply", "plx", 1).as_bytes()).is_err(), "control");
+}
+
+#[test]
 fn hostile_headers_and_elements_are_rejected_before_allocation() {
     let replaced = |from: &str, to: &str| ascii().replace(from, to).into_bytes();
     let mut negative = binary(true);
@@ -227,6 +235,7 @@ fn hostile_headers_and_elements_are_rejected_before_allocation() {
         (b"ply\n".to_vec(), "header: expected ply, and end_header within 65536 bytes"),
         (replaced("vertex 4", "vertex 4000000000"), "element vertex: expected elements of at least 1 bytes that"),
         (replaced("vertex 4", "vertex 99999999999999999999999"), "header: expected a PLY header"),
+        (replaced("element face", "Created by me\nelement face"), "header: line "),
         (text_of(binary(true), "vertex 4", "vertex 400"), "element vertex: expected elements of at least 15 bytes"),
         (text_of(binary(true), "face 2", "face 18446744073709551615"), "element face: expected elements of at least"),
         (text_of(binary(true), "property float z", "property float y"), "header: expected a different name"),
