@@ -157,6 +157,12 @@ pub(in crate::load) fn has_arrays(files: &AssetDir, name: &str, arrays: &[&str])
     arrays.iter().all(|array| names.iter().any(|name| name == array))
 }
 
+/// Whether the file `name` is an archive in which [`declare_modes`] finds no array of U. Reads only the directory of the
+/// archive.
+pub(in crate::load) fn lacks_modes(files: &AssetDir, name: &str) -> bool {
+    open_file(files, name).is_some_and(|archive| modes_array(&array_names(&archive)).is_none())
+}
+
 /// Reads the directory of the archive in the file `name`. `None` if the file is not an archive.
 fn open_file(files: &AssetDir, name: &str) -> Option<ZipArchive<BufReader<File>>> {
     let (file, _) = files.open(name).ok().filter(|(_, file_bytes)| *file_bytes <= MAX_MODEL_BYTES)?;
@@ -175,18 +181,22 @@ fn in_array(error: Error, name: &str) -> Error {
     error.prefix_field(&format!("array '{name}'"))
 }
 
+/// The array of U among the arrays of an archive: `U`, `modes` or the only array.
+fn modes_array(names: &[String]) -> Option<&str> {
+    let only_array = match names {
+        [name] => Some(name.as_str()),
+        _ => None,
+    };
+    ["U", "modes"].into_iter().find(|name| names.iter().any(|other| other == name)).or(only_array)
+}
+
 /// Declares the array of U and the array `eigenvalues`, if there is one. Returns the name of the array of U: `U`, `modes`
 /// or the only array.
 ///
 /// # Errors
 /// `Invalid` if U is missing, or a header is invalid; `OutOfMemory`.
 pub(in crate::load) fn declare_modes(archive: &mut NpzArchive<'_>) -> Result<String> {
-    let is_array = |name: &&str| archive.names().iter().any(|other| other == name);
-    let only_array = match archive.names() {
-        [name] => Some(name.as_str()),
-        _ => None,
-    };
-    let name = ["U", "modes"].into_iter().find(is_array).or(only_array);
+    let name = modes_array(archive.names());
     let name = name.ok_or_else(|| invalid("archive", "an array named U", archive.list_names()))?.to_owned();
     let check_rank = |shape: &[usize]| match shape {
         [.., rank] if *rank > MAX_RANK => Err(invalid("shape", format!("at most {MAX_RANK} columns"), rank)),

@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 
+use super::npz::lacks_modes;
 use crate::error::Result;
 use crate::load::asset_dir::{AssetDir, EntryKind, stem_of};
 use crate::load::folder_listing::{FolderListing, ModesNames};
@@ -49,7 +50,8 @@ pub(in crate::load) struct Sidecar {
 /// Finds the modes of the model `name` in its folder. A name consists of the name of the model, without extension and
 /// without `.derived`, and one of [`ENDINGS`]. If no file has such a name and the folder has no other model, the
 /// [`GENERIC_NAMES`] are tried. Letter case is ignored, unless a file has the exact name. A NumPy archive with a mesh is
-/// not used, because it is a model, whose U has the rows of its own vertices.
+/// not used, because it is a model, whose U has the rows of its own vertices. Neither is an archive without U, unless its
+/// name says that it has modes: many programs write data of a model in an archive of the same name.
 ///
 /// # Errors
 /// `Invalid` for a name that leaves the root of the repository.
@@ -67,12 +69,21 @@ pub(in crate::load) fn find_sidecar(files: &AssetDir, name: &str) -> Result<Side
             Some(EntryKind::File) => Some(candidate.as_str()),
             _ => listing.names_ignoring_case(candidate, EntryKind::File).find(|other| *other != name),
         };
-        file = found.filter(|found| find_model(files, found).is_none()).map(str::to_owned);
+        let is_used = |found: &&str| find_model(files, found).is_none() && !is_unrelated_archive(files, found);
+        file = found.filter(is_used).map(str::to_owned);
         if file.is_some() {
             break;
         }
     }
     Ok(Sidecar { remark: unused_remark(names, name, file.as_deref()), file })
+}
+
+/// Whether a file is a NumPy archive without U whose name does not say that it has modes.
+fn is_unrelated_archive(files: &AssetDir, name: &str) -> bool {
+    let lower_case = name.to_ascii_lowercase();
+    let stem = lower_case.strip_suffix(".npz");
+    let says_modes = |stem: &str| matches!(stem.rsplit('.').next(), Some("u" | "modes"));
+    stem.is_some_and(|stem| !says_modes(stem)) && lacks_modes(files, name)
 }
 
 /// Collects the names of a folder for the search for modes.
@@ -188,6 +199,18 @@ mod tests {
         // Control: an archive without a mesh.
         assert_eq!(find(&["U", "vertices"], &["a.stl", "a.npz"]).file.as_deref(), Some("a.npz"));
         assert_eq!(find(&["U"], &["a.stl", "modes.npz"]).file.as_deref(), Some("modes.npz"));
+        // Archives of other programs without U.
+        let other = find(&["triangles", "vertex_colors"], &["a.stl", "a.npz"]);
+        assert_eq!(other.file, None);
+        assert!(other.remark.expect("a remark").starts_with("not used as modes: a.npz: the modes of MODEL are in"));
+        for name in ["a.U.npz", "modes.npz"] {
+            let named = find(&["triangles", "vertex_colors"], &["a.stl", name]);
+            assert_eq!(
+                named.file.as_deref(),
+                Some(name),
+                "its name says that it has modes, so that their lack is an error"
+            );
+        }
     }
 
     #[test]
