@@ -105,8 +105,12 @@ impl Mesh {
     /// The rest positions of the vertices that triangles use, one per use. Only these vertices are drawn: bounds,
     /// ground and cameras ignore the others.
     pub fn drawn_positions(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        let position = |corner: &u32| self.rest_positions[self.corners.vertices[*corner as usize] as usize];
-        self.triangles.as_flattened().iter().map(position)
+        self.drawn_vertices().map(|vertex| self.rest_positions[vertex])
+    }
+
+    /// The vertices that triangles use, with repetitions.
+    pub(crate) fn drawn_vertices(&self) -> impl Iterator<Item = usize> + '_ {
+        self.triangles.as_flattened().iter().map(|corner| self.corners.vertices[*corner as usize] as usize)
     }
 
     /// The same mesh with other rest positions, one per vertex.

@@ -187,6 +187,10 @@ mod tests {
 
     /// A triangle with two modes and a vertex at `stray`, which no triangle uses.
     fn scene_with(stray: [f32; 3]) -> std::sync::Arc<Scene> {
+        scene_with_rest_q(stray, vec![])
+    }
+
+    fn scene_with_rest_q(stray: [f32; 3], rest_q: Vec<f32>) -> std::sync::Arc<Scene> {
         let positions = vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.5], stray];
         let mesh = Mesh::from_indexed(positions, vec![[0.0, 0.0, 1.0]; 4], vec![], vec![[0, 1, 2]]).expect("a mesh");
         // The first mode moves the drawn vertices along x, and the second one only the stray vertex.
@@ -195,7 +199,7 @@ mod tests {
         let mut parts = SceneParts::named("stray");
         parts.shapes.push(Shape::new(mesh, modes).expect("a shape"));
         parts.materials.push(Material::default());
-        parts.domains.push(Domain::new("body", 0));
+        parts.domains.push(Domain { rest_q, ..Domain::new("body", 0) });
         Scene::new(parts).expect("a scene")
     }
 
@@ -242,6 +246,16 @@ mod tests {
                 assert!(clipped.diagonal() < 3.0 * drawn.diagonal(), "{q:?}: {clipped:?}");
             }
             assert!(all.world.diagonal() > 100.0, "control");
+        }
+    }
+
+    /// The first mode moves the triangle along x.
+    #[test]
+    fn rest_bounds_include_the_coordinates_of_the_rest_state() {
+        let bounds = |rest_q: &[f32]| scene_with_rest_q([0.0; 3], rest_q.to_vec()).rest_bounds;
+        assert_eq!(bounds(&[2.0, 7.0]), BoundingBox { min: [2.0, 0.0, 0.0], max: [3.0, 1.0, 0.5] });
+        for undeformed in [&[][..], &[0.0, 7.0]] {
+            assert_eq!(bounds(undeformed), BoundingBox { min: [0.0; 3], max: [1.0, 1.0, 0.5] });
         }
     }
 

@@ -125,7 +125,7 @@ pub struct Scene {
     pub transform_roots: TransformRoots,
     /// The optional features that the scene uses.
     pub features: SceneFeatures,
-    /// Bounds of the drawn vertices at rest in scene units.
+    /// Bounds of the drawn vertices of the rest state, T (x0 + U q) with the q of the files, in scene units.
     pub rest_bounds: BoundingBox,
     /// Bounds of the drawn vertices of each shape.
     pub drawn_bounds: DrawnBounds,
@@ -245,11 +245,19 @@ impl Scene {
 
     fn compute_rest_bounds(&self) -> BoundingBox {
         let mut bounds = BoundingBox::EMPTY;
-        for domain in &self.domains {
+        let is_deformed = self.domains.iter().any(|domain| !domain.rest_q.is_empty());
+        let rest_state = is_deformed.then(|| SceneState::rest(self));
+        for (index, domain) in self.domains.iter().enumerate() {
             let (world_from_domain, shape) = (domain.placement_matrix(), &self.shapes[domain.shape]);
-            for position in shape.mesh.drawn_positions() {
-                let x0 = std::array::from_fn(|axis| f64::from(position[axis]) + shape.origin()[axis]);
-                bounds.include(far_domains::transform_point(&world_from_domain, x0));
+            let rest_q = rest_state.as_ref().map_or(&[][..], |state| state.q_of(self, index));
+            for vertex in shape.mesh.drawn_vertices() {
+                let x0 = shape.mesh.rest_positions()[vertex];
+                let displacement = |axis: usize| -> f64 {
+                    let modes = rest_q.iter().enumerate().filter(|(_, q)| **q != 0.0);
+                    modes.map(|(mode, q)| f64::from(*q) * f64::from(shape.modes.entry(vertex, axis, mode))).sum()
+                };
+                let x = std::array::from_fn(|axis| f64::from(x0[axis]) + shape.origin()[axis] + displacement(axis));
+                bounds.include(far_domains::transform_point(&world_from_domain, x));
             }
         }
         bounds
