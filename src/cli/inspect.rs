@@ -13,6 +13,7 @@ use modalcast_compute::gpu::{self, CudaDeformerOptions, DeformPlan};
 use modalcast_model::backend_settings::{BackendSettings, DeformTable, LookTable};
 use modalcast_model::error::fault_in;
 use modalcast_model::load::{self, OpenedScene};
+use modalcast_model::rounding::to_significant_digits;
 use modalcast_model::scene::{Scene, SceneFeatures, UpAxis};
 use modalcast_render::{Pass, RenderPlan};
 
@@ -188,7 +189,13 @@ fn text_lines(opened_scene: &OpenedScene) -> Vec<String> {
     let entries = totals.as_object().into_iter().flatten();
     lines.extend(entries.map(|(name, value)| format!("{:<28}{value:>16}", format!("total {name}"))));
     let diagonal = scene.rest_bounds.diagonal();
-    lines.push(format!("up {:?}, unit {} m, diagonal {diagonal:.4}, origin {:?}", scene.up, scene.unit, scene.origin));
+    lines.push(format!(
+        "up {:?}, unit {} m, diagonal {}, origin {:?}",
+        scene.up,
+        scene.unit,
+        to_significant_digits(diagonal, 4),
+        scene.origin
+    ));
     lines.extend(load::modes_files(scene).iter().map(|file| format!("modes: {file}")));
     if let [domain] = &scene.domains[..] {
         lines.extend(domain.metadata.notes.iter().map(|(name, text)| format!("note {name}: {}", shortened(text))));

@@ -12,6 +12,7 @@ pub mod fault_injection;
 pub mod load;
 pub mod memory;
 pub mod raster;
+pub mod rounding;
 pub mod scene;
 pub mod shared_memory;
 pub mod tree;

@@ -2,6 +2,7 @@
 
 use std::ops::RangeInclusive;
 
+use crate::rounding::to_significant_digits;
 use crate::scene::Scene;
 
 /// Diagonals of plausible scenes in meters. Most parts and buildings are smaller than the upper limit. In millimeters, a
@@ -26,9 +27,8 @@ pub(super) fn implausible_size(scene: &Scene) -> Option<String> {
 
 /// A length with three significant digits. Large and small numbers have an exponent.
 fn rounded(length: f64) -> String {
-    let text = format!("{length:.2e}");
-    let number: f64 = text.parse().unwrap_or(length);
-    if number == 0.0 || (1e-4..1e6).contains(&number) { number.to_string() } else { text }
+    let number = to_significant_digits(length, 3);
+    if number == 0.0 || (1e-4..1e6).contains(&number) { number.to_string() } else { format!("{length:.2e}") }
 }
 
 #[cfg(test)]

@@ -11,11 +11,21 @@ use nalgebra::{Matrix4, Point3};
 use super::{BoundingBox, SceneParts};
 use crate::domain::{Domain, MAX_DIAGONALS, Mesh, Shape, origin_of_bounds};
 use crate::error::Result;
+use crate::rounding::to_significant_digits;
 
 /// The largest distance of a domain in diagonals of its own bounds. It is large, because far domains have floating
 /// origins of their own, which a frame pays for with a pass over all vertices on the host, and because only the place
 /// of the domain is rounded, not its shape: by at most 2^-24 x 2^16 = 0.4 % of its diagonal.
 const MAX_OWN_DIAGONALS: f64 = 65_536.0;
+
+/// The largest error on an axis of a step with f32 transforms, in terms of the largest coordinate d of a domain.
+///
+/// A client that rounds T = (A, t) to f32 changes each entry of A by at most 2^-25, and t, which is at most 2 d, by at
+/// most 2^-23 d. On each axis, T x0 then changes by at most 3 x 2^-25 d + 2^-23 d, which is less than 2^-22 d.
+const F32_TRANSFORM_ERROR: f64 = 1.0 / 4_194_304.0;
+
+/// The error that needs no remark, in diagonals of the scene: the accuracy that the project promises.
+const PROMISED_ERROR: f64 = 1e-5;
 
 /// The bounds that decide whether a domain is far.
 struct Extents {
@@ -36,6 +46,12 @@ impl Extents {
         Self { shapes, domains, diagonal: bounds.diagonal() }
     }
 
+    /// The error of the place of a domain that needs no remark, in scene units.
+    fn tolerated_error(&self, domain: usize) -> f64 {
+        let own_limit = F32_TRANSFORM_ERROR * MAX_OWN_DIAGONALS * self.domains[domain].diagonal();
+        (PROMISED_ERROR * self.diagonal).min(own_limit)
+    }
+
     /// The largest coordinate that f32 represents well enough for a domain, in scene units.
     fn largest_coordinate(&self, domain: usize) -> f64 {
         let limit = MAX_DIAGONALS * self.diagonal;
@@ -47,8 +63,8 @@ impl Extents {
 }
 
 /// Decides which domains are far, and removes the origins of the shapes and the remainders of the placements that do
-/// not matter. Centers shapes that are far without having an origin. Returns a remark if any domain is far, else
-/// `None`.
+/// not matter. Centers shapes that are far without having an origin. Returns a remark if steps with f32 transforms would
+/// misplace a domain by more than the promised accuracy.
 ///
 /// # Errors
 /// `Invalid` if a position exceeds the range of f32.
@@ -56,8 +72,8 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<Stri
     let SceneParts { shapes, domains, .. } = parts;
     let extents = Extents::new(shapes, domains);
     let mut is_far_shape = vec![false; shapes.len()];
-    // Per far domain, its index and its largest coordinate.
-    let mut far_domains: Vec<(usize, f64)> = Vec::new();
+    // Domains that steps with f32 transforms misplace: the index and the largest coordinate of each.
+    let mut misplaced: Vec<(usize, f64)> = Vec::new();
     for (index, domain) in domains.iter_mut().enumerate() {
         let limit = extents.largest_coordinate(index);
         // A scene of a single point has no size to compare with.
@@ -67,10 +83,10 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<Stri
         let shape_reach = scale * largest_coordinate(extents.shapes[domain.shape]);
         let reach = shape_reach.max(largest_coordinate(extents.domains[index]));
         is_far_shape[domain.shape] |= is_far(shape_reach);
-        if is_far(reach) {
-            far_domains.push((index, reach));
-        } else {
+        if !is_far(reach) {
             domain.placement_remainder = [0.0; 12];
+        } else if F32_TRANSFORM_ERROR * reach > extents.tolerated_error(index) {
+            misplaced.push((index, reach));
         }
     }
     for (index, shape) in shapes.iter_mut().enumerate() {
@@ -83,30 +99,21 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<Stri
             shape.set_origin(origin)?;
         }
     }
-    Ok(far_remark(parts, &far_domains))
+    Ok(far_remark(parts, &misplaced))
 }
 
-/// A remark on the error of steps with f32 transforms.
-///
-/// Let d be the largest coordinate of a domain. A client that rounds T = (A, t) to f32 changes each entry of A by at
-/// most 2^-25, and t, which is at most 2 d, by at most 2^-23 d. On each axis, T x0 then changes by at most
-/// 3 x 2^-25 d + 2^-23 d, which is less than 2^-22 d.
-fn far_remark(parts: &SceneParts, far_domains: &[(usize, f64)]) -> Option<String> {
-    let (index, reach) = far_domains.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
-    let others = far_domains.len() - 1;
+/// A remark on the error of steps with f32 transforms, in a scene where it matters.
+fn far_remark(parts: &SceneParts, misplaced: &[(usize, f64)]) -> Option<String> {
+    let (index, reach) = misplaced.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
+    let others = misplaced.len() - 1;
     let more = if others > 0 { format!(" and {others} other domains are") } else { " is".to_owned() };
     let [distance, error] =
-        [*reach, *reach * 2.0_f64.powi(-22)].map(|length| two_digits(length * parts.meters_per_unit()));
+        [*reach, *reach * F32_TRANSFORM_ERROR].map(|length| to_significant_digits(length * parts.meters_per_unit(), 2));
     Some(format!(
         "'{}'{more} far from the origin ({distance} m): the rest state and f64 poses are exact, but a step with f32 \
          transforms places it with an error of up to {error} m on each axis",
         parts.domains[*index].name
     ))
-}
-
-/// A number rounded to two significant digits.
-fn two_digits(number: f64) -> f64 {
-    format!("{number:.1e}").parse().unwrap_or(number)
 }
 
 /// The bounds of the vertices that triangles use, in f64.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, Matrix4, Point3, Quaternion, UnitQuaternion, Vector3};
 
 use crate::domain::{Domain, FollowConstraint, Material, Mesh, Modes, RestOrigin, Shape, Transform};
-use crate::scene::{RawStepUpdate, Scene, SceneParts, SceneState, StepUpdate, TransformFormat};
+use crate::scene::{BoundingBox, RawStepUpdate, Scene, SceneParts, SceneState, StepUpdate, TransformFormat};
 
 /// Largest accepted error of a vertex, in diagonals of a domain. The promise is 1e-5.
 const MAX_ERROR: f64 = 2e-6;
@@ -190,6 +190,18 @@ fn f32_transforms_have_at_most_the_error_of_the_remark() {
     state.apply(&scene, &StepUpdate::parse(&scene, &identity).expect("a valid step"));
     let expected = expected_positions(&scene, 0, &x0, 0.0, &Matrix4::identity());
     assert!(relative_error(&computed_positions(&scene, &state, 0), &expected) <= MAX_ERROR);
+}
+
+/// A remark is due where f32 transforms misplace a body by more than the promised 1e-5 diagonals: from 42 diagonals on.
+#[test]
+fn remark_is_due_above_the_promised_error() {
+    for (distance, has_remark) in [(2.0, false), (12.0, false), (35.0, false), (60.0, true), (1000.0, true)] {
+        let x0 = tetrahedron([0.0; 3]);
+        let size = BoundingBox::from_positions(&x0.iter().flatten().map(|number| *number as f32).collect::<Vec<_>>());
+        let scene = scene_of(&[tetrahedron([distance * size.diagonal(), 0.0, 0.0])]);
+        assert_eq!(scene.is_far, distance > 8.5, "{distance}");
+        assert_eq!(scene.remarks.len(), usize::from(has_remark), "{distance}: {:?}", scene.remarks);
+    }
 }
 
 /// A scene near its origin has the bits that it has without any of this: no origins, and placements in f32.
