@@ -309,6 +309,11 @@ impl AssetDir {
         Ok(Self { scene_folder, ..folder })
     }
 
+    /// The folder to which paths are relative.
+    pub(super) fn folder(&self) -> &Path {
+        &self.base
+    }
+
     /// The last component of the resolved path, or `scene` if it has none or does not resolve.
     pub(super) fn resolved_name(&self, relative: &str) -> String {
         let path = self.resolve(relative).ok();

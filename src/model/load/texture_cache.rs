@@ -1,16 +1,17 @@
 //! Cache of a scene's image files, each decoded once.
 
 use std::collections::HashMap;
+use std::path::PathBuf;
 
 use super::asset_dir::{AssetDir, MAX_IMAGE_BYTES};
 use crate::domain::Texture;
 use crate::error::Result;
 
-/// The textures of a scene and their indices by name.
+/// The textures of a scene and their indices by folder and name.
 #[derive(Debug, Default)]
 pub(super) struct TextureCache {
     textures: Vec<Texture>,
-    index_by_name: HashMap<String, usize>,
+    index_by_name: HashMap<(PathBuf, String), usize>,
 }
 
 impl TextureCache {
@@ -19,19 +20,26 @@ impl TextureCache {
     /// # Errors
     /// `Invalid` if the file does not exist or is not a PNG, JPEG or WebP image.
     pub(super) fn load(&mut self, files: &AssetDir, path: &str) -> Result<usize> {
-        self.get_or_insert_with(path, || decode(files, path))
+        self.get_or_insert_with(files, path, || decode(files, path))
     }
 
-    /// Returns the index of the texture called `name`. The first call for a name creates the texture with `create`.
+    /// Returns the index of the texture called `name` in the folder `files`. The first call for a name creates the texture
+    /// with `create`.
     ///
     /// # Errors
     /// Those of `create`.
-    pub(super) fn get_or_insert_with(&mut self, name: &str, create: impl FnOnce() -> Result<Texture>) -> Result<usize> {
-        if let Some(index) = self.index_by_name.get(name) {
+    pub(super) fn get_or_insert_with(
+        &mut self,
+        files: &AssetDir,
+        name: &str,
+        create: impl FnOnce() -> Result<Texture>,
+    ) -> Result<usize> {
+        let key = (files.folder().to_owned(), name.to_owned());
+        if let Some(index) = self.index_by_name.get(&key) {
             return Ok(*index);
         }
         self.textures.push(create()?);
-        self.index_by_name.insert(name.to_owned(), self.textures.len() - 1);
+        self.index_by_name.insert(key, self.textures.len() - 1);
         Ok(self.textures.len() - 1)
     }
 

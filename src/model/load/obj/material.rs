@@ -120,7 +120,7 @@ fn load_color_texture(
         (Some(color_path), Some(alpha_path)) if color_path != alpha_path => {
             let texture_name = format!("{color_path} with the alpha of {alpha_path}");
             texture_cache
-                .get_or_insert_with(&texture_name, || {
+                .get_or_insert_with(files, &texture_name, || {
                     replace_alpha(&texture_name, Some(&decode(files, color_path)?), &decode(files, alpha_path)?)
                 })
                 .map(Some)
@@ -128,7 +128,9 @@ fn load_color_texture(
         (None, Some(alpha_path)) => {
             let texture_name = format!("white with the alpha of {alpha_path}");
             texture_cache
-                .get_or_insert_with(&texture_name, || replace_alpha(&texture_name, None, &decode(files, alpha_path)?))
+                .get_or_insert_with(files, &texture_name, || {
+                    replace_alpha(&texture_name, None, &decode(files, alpha_path)?)
+                })
                 .map(Some)
         }
         (Some(color_path), _) => texture_cache.load(files, color_path).map(Some),

@@ -255,6 +255,26 @@ mod tests {
     }
 
     #[test]
+    fn libraries_of_two_folders_have_images_of_their_own() {
+        let folder = create_folder(&[(
+            "a.obj",
+            &format!("mtllib a/m.mtl b/m.mtl\n{TRIANGLE}usemtl a\nf 1 2 3\nusemtl b\nf 1 2 3\n"),
+        )]);
+        for (name, pixel) in [("a", [255, 0, 0]), ("b", [0, 0, 255])] {
+            let library = folder.path().join(name);
+            std::fs::create_dir(&library).expect("a new folder");
+            std::fs::write(library.join("m.mtl"), format!("newmtl {name}\nmap_Kd skin.png\n")).expect("a library");
+            image::RgbImage::from_pixel(1, 1, image::Rgb(pixel)).save(library.join("skin.png")).expect("an image");
+        }
+        let files = AssetDir::unrestricted(folder.path());
+        let scene = read(&files, "a.obj", ModelOptions::default()).expect("a textured mesh");
+        let color = |material: usize| {
+            scene.materials[material].color_texture.map(|texture| scene.textures[texture].rgba()[..3].to_vec())
+        };
+        assert_eq!((color(0), color(1)), (Some(vec![255, 0, 0]), Some(vec![0, 0, 255])));
+    }
+
+    #[test]
     fn colors_of_vertices_are_drawn_unless_there_is_an_image() {
         let colored = "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
         let folder = create_folder(&[
