@@ -2,7 +2,14 @@
 // derivatives, so that fragment and compute shaders can call it. NaN inputs give a finite result. A map position is x,
 // y and depth in the shadow map, each from 0 to 1. With cascades, x and y are those of the point's layer.
 #ifdef SHADOWS
-layout(binding = 0) uniform sampler2DArray shadow_map;
+#ifdef SHADOW_VARIANCE
+layout(binding = 0) uniform sampler2DArray shadow_moments;
+#ifdef PCF_FALLBACK
+layout(binding = 27) uniform sampler2DArray shadow_depth;
+#endif
+#else
+layout(binding = 0) uniform sampler2DArray shadow_depth;
+#endif
 
 #ifdef CASCADES
 vec2 cascade_scale(int layer) { return cascades.scale_offsets[layer].xy; }
@@ -23,35 +30,7 @@ vec2 receiver_plane_gradient(vec3 normal, int layer) {
     return -(light_normal.xy / axis_squares.xy) * (axis_squares.z / clamped_z) / (frame.shadow.w * cascade_scale(layer));
 }
 
-#ifdef SHADOW_VARIANCE
-// Bias that compensates for ground depth leaking into the blurred mean near a contact line, where a surface meets the
-// ground. The leak would pull the mean towards the sun, although the ground casts no shadow. Let h be the height above
-// the line in standard deviations of the blur, and k the depth difference of surface and ground per standard deviation.
-// The ground shifts the mean by k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal
-// distribution. The bias 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
-float contact_bias(vec3 position, int layer, vec3 normal) {
-    vec2 map_position = position.xy;
-#ifdef CASCADES
-    map_position = from_cascade(map_position, layer);
-#endif
-    float depth_above_ground = max(dot(frame.shadow_ground_plane.xy, map_position) + frame.shadow_ground_plane.z - position.z, 0.0);
-    float gradient_difference = DEVIATION * length(receiver_plane_gradient(normal, layer) - receiver_plane_gradient(frame.up.xyz, layer));
-    float proximity = 1.0 - 0.5 * depth_above_ground / max(gradient_difference, 1e-12);
-    return proximity > 0.0 ? 0.4 * gradient_difference * proximity * proximity : 0.0;
-}
-
-// Chebyshev's bound from the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1). Depth is measured
-// from the center of its range, which reduces rounding errors.
-float shadow_visibility(vec3 position, int layer, vec3 normal) {
-    vec2 moments = textureLod(shadow_map, vec3(position.xy, float(layer)), 0.0).xy;
-    float excess_depth = clamp(position.z, 0.0, 1.0) - 0.5 - moments.x - contact_bias(position, layer, normal);
-    if (!(excess_depth > 0.0)) return 1.0;
-    // `frame.shadow`: minimum variance in x, light bleeding reduction in y.
-    float variance = max(moments.y - moments.x * moments.x, frame.shadow.x);
-    float bound = variance / (variance + excess_depth * excess_depth);
-    return clamp((bound - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0);
-}
-#else
+#if !defined(SHADOW_VARIANCE) || defined(PCF_FALLBACK)
 // Bias of the comparison. A texel's depth is compared with the depth of the surface plane at the texel's center, so a
 // slope does not shadow itself. A caster must be in front of that plane by at least the side of a texel, because on
 // curved surfaces the triangles deviate from the plane that the normal defines. The term 4e-7 covers the rounding of
@@ -75,37 +54,109 @@ const float NO_CASTER_DEPTH = 1.0;
 // Standard shadow map: 0 or 1, from the texel that contains the point.
 float shadow_visibility(vec3 position, int layer, vec3 normal) {
     vec2 texel = position.xy * frame.shadow.w;
-    float depth = caster_depth(texelFetch(shadow_map, ivec3(texel, layer), 0).x);
+    float depth = caster_depth(texelFetch(shadow_depth, ivec3(texel, layer), 0).x);
     float receiver_depth = position.z - depth_bias(layer) + dot(receiver_plane_gradient(normal, layer), floor(texel) + 0.5 - texel);
     return depth >= NO_CASTER_DEPTH || receiver_depth <= depth ? 1.0 : 0.0;
 }
 #endif
 
-#ifdef SHADOW_FILTERED
+#if defined(SHADOW_FILTERED) || defined(PCF_FALLBACK)
+// Weights of the texels at these distances from the center, along one axis.
+vec3 tap_weights(vec3 offsets) { return TAP_SCALE * exp2(TAP_FALLOFF * offsets * offsets); }
+
 // Percentage-closer filtering: weight of the texels without a caster in front of the point. The weights are a Gaussian
-// centered at the point. TAPS is one half of the Gaussian, center first, with a trailing 0.
-float shadow_visibility(vec3 position, int layer, vec3 normal) {
+// centered at the point. GATHERS x GATHERS texture gathers read four texels each; GATHER_SPACING is even and the distance
+// of two gathers in texels, 2 if no texel is skipped. `rows` is GATHERS.
+float percentage_closer_visibility(vec3 position, int layer, vec3 normal, int rows) {
     vec2 texel = position.xy * frame.shadow.w - 0.5;
     vec2 base_texel = floor(texel); // the point lies between this texel's center and those of its next neighbors
     vec2 fraction = texel - base_texel;
     vec2 gradient = receiver_plane_gradient(normal, layer);
     float receiver_depth = position.z - depth_bias(layer), lit_weight = 0.0;
-    for (int y = -RADIUS; y <= RADIUS; y += 2) {
+    const float first_offset = float((1 - GATHERS) * GATHER_SPACING / 2);
+    for (int row = 0; row < rows; row++) {
+        float y = first_offset + float(row * GATHER_SPACING);
         // Weights of rows y and y + 1, interpolated between Gaussians that are centered at rows 0 and 1.
-        vec2 row_weights = mix(vec2(TAPS[abs(y)], TAPS[abs(y + 1)]), vec2(TAPS[abs(y - 1)], TAPS[abs(y)]), fraction.y);
-        for (int x = -RADIUS; x <= RADIUS; x += 2) {
-            vec2 column_weights = mix(vec2(TAPS[abs(x)], TAPS[abs(x + 1)]), vec2(TAPS[abs(x - 1)], TAPS[abs(x)]), fraction.x);
+        vec3 row_taps = tap_weights(vec3(y - 1.0, y, y + 1.0));
+        vec2 row_weights = mix(row_taps.yz, row_taps.xy, fraction.y);
+        for (int column = 0; column < GATHERS; column++) {
+            float x = first_offset + float(column * GATHER_SPACING);
+            vec3 column_taps = tap_weights(vec3(x - 1.0, x, x + 1.0));
+            vec2 column_weights = mix(column_taps.yz, column_taps.xy, fraction.x);
             vec2 corner = vec2(x, y);
             // The four texels around their common corner, in textureGather order (0, 1), (1, 1), (1, 0), (0, 0).
-            vec4 depth = caster_depth(textureGather(shadow_map, vec3((base_texel + corner + 1.0) / frame.shadow.w, float(layer)), 0));
+            vec4 depth = caster_depth(textureGather(shadow_depth, vec3((base_texel + corner + 1.0) / frame.shadow.w, float(layer)), 0));
             float corner_depth = receiver_depth + dot(gradient, corner - fraction);
             vec4 receiver_depths = corner_depth + vec4(gradient.y, gradient.x + gradient.y, gradient.x, 0.0);
             vec4 is_lit = vec4(lessThanEqual(receiver_depths, depth));
             is_lit = max(is_lit, vec4(greaterThanEqual(depth, vec4(NO_CASTER_DEPTH))));
-            lit_weight += dot(is_lit, row_weights.yyxx * column_weights.xyyx);
+            lit_weight += dot(row_weights.yyxx * column_weights.xyyx, is_lit);
         }
     }
-    return clamp(lit_weight, 0.0, 1.0);
+    return lit_weight;
+}
+#endif
+
+#ifdef SHADOW_FILTERED
+float shadow_visibility(vec3 position, int layer, vec3 normal) {
+    return percentage_closer_visibility(position, layer, normal, GATHERS);
+}
+#endif
+
+#ifdef SHADOW_VARIANCE
+// Bias that compensates for ground depth leaking into the blurred mean near a contact line, where a surface meets the
+// ground. The leak would pull the mean towards the sun, although the ground casts no shadow. Let h be the height above
+// the line in standard deviations of the blur, and k the depth difference of surface and ground per standard deviation.
+// The ground shifts the mean by k (phi(h) - h Q(h)), with the density phi and the upper tail Q of the normal
+// distribution. The bias 0.4 k (1 - h / 2)^2 is an upper bound of this shift up to h = 1.9.
+float contact_bias(vec3 position, int layer, vec3 normal) {
+    vec2 map_position = position.xy;
+#ifdef CASCADES
+    map_position = from_cascade(map_position, layer);
+#endif
+    float depth_above_ground = max(dot(frame.shadow_ground_plane.xy, map_position) + frame.shadow_ground_plane.z - position.z, 0.0);
+    float gradient_difference = DEVIATION * length(receiver_plane_gradient(normal, layer) - receiver_plane_gradient(frame.up.xyz, layer));
+    float proximity = 1.0 - 0.5 * depth_above_ground / max(gradient_difference, 1e-12);
+    return proximity > 0.0 ? 0.4 * gradient_difference * proximity * proximity : 0.0;
+}
+
+#ifdef PCF_FALLBACK
+// Whether the moments show that no occluder is in front of the surface within the filter: the mean is not in front of
+// the surface by more than the bias of a comparison, and the variance is that of the surface plane. The factor 1.5
+// covers curvature and interpolated normals.
+bool has_moments_of_surface(float excess_depth, float variance, int layer, vec3 normal) {
+    vec2 slope = DEVIATION * receiver_plane_gradient(normal, layer);
+    return !(excess_depth > depth_bias(layer)) && !(variance > 1.5 * dot(slope, slope) + ROUNDING_VARIANCE);
+}
+#endif
+
+// `frame.shadow.y` is the light bleeding reduction.
+float reduce_bleeding(float visibility) { return clamp((visibility - frame.shadow.y) / (1.0 - frame.shadow.y), 0.0, 1.0); }
+
+// Chebyshev's bound from the blurred moments of depth (equation 3.10 with the variance M2 - M1 M1). Depth is measured
+// from the center of its range, which reduces rounding errors. The bound is exact for one occluder depth in front of the
+// surface, and too large for several: light would bleed. So the moments only decide that a point is in full shadow or
+// fully lit. At all other points, percentage-closer filtering of the depths replaces the bound if it is smaller.
+float shadow_visibility(vec3 position, int layer, vec3 normal) {
+    vec2 moments = textureLod(shadow_moments, vec3(position.xy, float(layer)), 0.0).xy;
+    float excess_depth = clamp(position.z, 0.0, 1.0) - 0.5 - moments.x - contact_bias(position, layer, normal);
+    float variance = moments.y - moments.x * moments.x, bound = 1.0;
+    if (excess_depth > 0.0) {
+        float clamped_variance = max(variance, frame.shadow.x); // `frame.shadow.x`: minimum variance
+        bound = clamped_variance / (clamped_variance + excess_depth * excess_depth);
+    }
+    float visibility = reduce_bleeding(bound);
+#ifdef PCF_FALLBACK
+    if (visibility > 0.0 && !has_moments_of_surface(excess_depth, variance, layer, normal)) {
+        // Software rasterizers execute unrolled loops also where no lane is in this branch. A number of rows that depends
+        // on a uniform prevents unrolling.
+        int rows = frame.shadow.w > 0.0 ? GATHERS : 0;
+        float filtered = percentage_closer_visibility(position, layer, normal, rows);
+        // Filtered depths leak no light, unless texels are skipped: then penumbrae are a few percent too bright or dark.
+        visibility = min(visibility, GATHER_SPACING > 2 ? reduce_bleeding(filtered) : filtered);
+    }
+#endif
+    return visibility;
 }
 #endif
 

@@ -4,6 +4,10 @@ layout(binding = 0) uniform sampler2DArray source; // with FROM_DEPTH: depth; el
 #ifdef DEPTH_IN_BUFFER
 // Depth from the compute rasterizer, top row first.
 layout(std430, binding = 0) readonly buffer RasterDepths { float raster_depths[]; };
+#ifdef PCF_FALLBACK
+// Copy of the depth, bottom row first, for lookups that filter it.
+layout(r32f, binding = 1) uniform writeonly image2D depth_copy;
+#endif
 #endif
 #ifdef CASCADES
 layout(location = 1) uniform int layer;
@@ -26,6 +30,10 @@ float centered_depth(ivec2 texel, int side) {
     ivec2 inside_texel = clamp(texel, ivec2(0), ivec2(side - 1));
 #ifdef DEPTH_IN_BUFFER
     float reversed_depth = raster_depths[(side - 1 - inside_texel.y) * side + inside_texel.x];
+#ifdef PCF_FALLBACK
+    // Workgroups with overlapping margins store equal values.
+    imageStore(depth_copy, inside_texel, vec4(reversed_depth));
+#endif
 #else
     float reversed_depth = texelFetch(source, ivec3(inside_texel, layer), 0).x;
 #endif

@@ -26,6 +26,7 @@ mod shadow;
 mod shadow_cache;
 mod shadow_extremes;
 mod shadow_ground;
+mod shadow_layers;
 mod shadow_methods;
 mod shadow_terminator;
 mod snapshots;

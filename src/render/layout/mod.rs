@@ -30,12 +30,14 @@ pub(crate) const VALUE_UNIT: u32 = 24;
 pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 /// Depth of the samples whose ids are at [`ID_UNIT`].
 pub(crate) const DEPTH_UNIT: u32 = 26;
+/// Depth of a variance shadow map, whose moments are at [`SHADOW_UNIT`].
+pub(crate) const SHADOW_DEPTH_UNIT: u32 = 27;
 /// Texture unit of the image that a program of the blur, the bloom or the sRGB encoding reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
-/// Maximum number of textures that the shading reads in addition to the scene's images: one for each of the 27 units
-/// from [`SHADOW_UNIT`] to [`DEPTH_UNIT`], except the 12 color and normal units, [`VALUE_UNIT`] and
+/// Maximum number of textures that the shading reads in addition to the scene's images: one for each of the 28 units
+/// from [`SHADOW_UNIT`] to [`SHADOW_DEPTH_UNIT`], except the 12 color and normal units, [`VALUE_UNIT`] and
 /// [`TRIANGLE_ID_UNIT`].
-pub(crate) const FIXED_TEXTURE_READS: usize = 13;
+pub(crate) const FIXED_TEXTURE_READS: usize = 14;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Uniform block bindings.

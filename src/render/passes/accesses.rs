@@ -15,6 +15,8 @@ pub(super) enum Resource {
     ShadowDepth,
     /// Shadow depth in a buffer, from the compute rasterizer.
     RasterShadowDepth,
+    /// Copy of `RasterShadowDepth` in an image.
+    ShadowDepthCopy,
     /// Moments of the shadow depth, blurred in x only.
     HorizontalMoments,
     ShadowMoments,
@@ -119,7 +121,11 @@ const LIST_TRIANGLES: Accesses = &[
 ];
 
 /// Lookups of the shadow map.
-const SHADOW_LOOKUP: Accesses = &[(Resource::ShadowDepth, Access::Sampled), (Resource::ShadowMoments, Access::Sampled)];
+const SHADOW_LOOKUP: Accesses = &[
+    (Resource::ShadowDepth, Access::Sampled),
+    (Resource::ShadowDepthCopy, Access::Sampled),
+    (Resource::ShadowMoments, Access::Sampled),
+];
 
 /// Inputs of the shading, and its outputs.
 const SHADING: Accesses = &[
@@ -159,6 +165,7 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
         &[&[
             (Resource::ShadowDepth, Access::Sampled),
             (Resource::RasterShadowDepth, Access::StorageRead),
+            (Resource::ShadowDepthCopy, Access::ImageWrite),
             (Resource::HorizontalMoments, Access::ImageWrite),
             (Resource::HorizontalMoments, Access::Sampled),
             (Resource::HorizontalMoments, Access::Attachment),

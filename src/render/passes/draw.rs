@@ -4,7 +4,8 @@ use super::recorder::PassRecorder;
 use crate::device::gl::{Gl, PipelineState, Program};
 use crate::layout::cull::command_offset;
 use crate::layout::{
-    CASCADE_BLOCK, COLOR_UNIT, DEPTH_UNIT, FRAME_BLOCK, ID_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_UNIT,
+    CASCADE_BLOCK, COLOR_UNIT, DEPTH_UNIT, FRAME_BLOCK, ID_UNIT, NORMAL_UNIT, POSITION_UNIT, SHADOW_DEPTH_UNIT,
+    SHADOW_UNIT,
 };
 use crate::pieces::PieceRange;
 use crate::resources::scene_buffers::SceneBuffers;
@@ -59,6 +60,9 @@ pub(super) fn bind_visibility(target: &RenderTarget) {
 pub(super) fn bind_shadow(buffers: &SceneBuffers) {
     if let Some(map) = &buffers.shadow {
         map.lookup_texture().bind(SHADOW_UNIT);
+        if map.shadow.filters_undecided_points() {
+            map.current_depth().bind(SHADOW_DEPTH_UNIT);
+        }
     }
 }
 

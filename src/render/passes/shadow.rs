@@ -18,6 +18,8 @@ use modalcast_model::error::{Result, fault_in};
 
 /// Image unit that the blur writes.
 const DESTINATION_IMAGE: u32 = 0;
+/// Image unit of the copy of the compute rasterizer's depth.
+const DEPTH_COPY_IMAGE: u32 = 1;
 
 /// Draws the depth from the sun into a layer of the map, unless the compute rasterizer has drawn it. Each cascade of the
 /// map is a layer. Several calls draw consecutive ranges of all triangles.
@@ -74,11 +76,14 @@ pub(crate) fn blur(recorder: &mut PassRecorder<'_>, buffers: &SceneBuffers, laye
     let mut programs: Vec<&Program> = buffers.programs.blur.iter().map(AsRef::as_ref).collect();
     recorder.begin(Pass::Blur);
     // If the compute rasterizer drew the depth, a program that reads the depth from a buffer replaces the first one.
-    if let (Some((depths, buffer_program)), Some(first_program)) =
-        (buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input), programs.first_mut())
-    {
+    let raster_input = buffers.shadow_rasterizer().and_then(ComputeRasterizer::blur_input);
+    map.set_depth_copied(raster_input.is_some());
+    if let (Some((depths, buffer_program)), Some(first_program)) = (raster_input, programs.first_mut()) {
         *first_program = buffer_program;
         depths.bind_storage(WORDS_BINDING);
+        if let Some(copy) = map.depth_copy() {
+            copy.bind_image_layer(DEPTH_COPY_IMAGE, layer);
+        }
     }
     match (programs.as_slice(), &blurred.horizontal) {
         // One compute pass blurs in both directions.

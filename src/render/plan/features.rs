@@ -87,7 +87,8 @@ pub(crate) fn shadow_defines(shadow: &ShadowSettings) -> impl Iterator<Item = &'
         ShadowMethod::Standard => "SHADOW_STANDARD",
         ShadowMethod::PercentageCloser => "SHADOW_FILTERED",
     };
-    ["SHADOWS", method].into_iter().chain(cascade_define(shadow))
+    let fallback = shadow.filters_undecided_points().then_some("PCF_FALLBACK");
+    ["SHADOWS", method].into_iter().chain(fallback).chain(cascade_define(shadow))
 }
 
 /// Define of the number of cascades; none for a map with one cascade.

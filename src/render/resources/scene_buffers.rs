@@ -422,6 +422,9 @@ impl SceneBuffers {
         let mut rasterizer =
             create_rasterizer(raster_mesh::raster_geometry(&self.scene, positions, gl.limits.anisotropy))?;
         rasterizer.precompile(passes.shadow, passes.visibility)?;
+        if let Some(map) = self.shadow.as_mut().filter(|_| passes.shadow) {
+            map.add_depth_copy(gl, budget)?;
+        }
         self.compute_rasterizer = Some(ComputeRasterizer::new(rasterizer, outputs, budget));
         Ok(())
     }
@@ -482,6 +485,8 @@ impl SceneBuffers {
         let values =
             self.values.iter().map(|values| Allocation { name: "vertex values".into(), bytes: values.buffer.bytes });
         let outputs = self.compute_rasterizer.iter().flat_map(ComputeRasterizer::allocations);
+        let depth_copy = self.shadow.as_ref().and_then(ShadowMap::depth_copy_bytes);
+        let outputs = outputs.chain(depth_copy.map(|bytes| ("shadow depth, copied", bytes)));
         let outputs = outputs.map(|(name, bytes)| Allocation { name: name.into(), bytes });
         let inner_edges = self.inner_edges.get();
         let inner_edges = inner_edges.map(|buffer| Allocation { name: "inner edges".into(), bytes: buffer.bytes });

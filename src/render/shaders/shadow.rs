@@ -74,20 +74,67 @@ impl BlurTile {
     }
 }
 
+/// Taps of percentage-closer filtering: a square of texture gathers, each of 2 x 2 texels, with Gaussian weights.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct PcfKernel {
+    /// Gathers along one axis.
+    gathers: u32,
+    /// Distance of adjacent gathers in texels, an even number; 2 if no texel is skipped.
+    spacing: u32,
+    /// Standard deviation in texels.
+    blur: f32,
+}
+
+impl PcfKernel {
+    /// Largest number of gathers along one axis where filtering supplements a variance map: all texels of a blur of up
+    /// to 6 texels. Wider kernels skip texels, because otherwise a blur of 16 would take a hundred times as long as the
+    /// lookup of the moments. Skipped texels let no light into full shadow.
+    const MAX_FALLBACK_GATHERS: u32 = 16;
+
+    /// The kernel of the settings; none if lookups do not filter the depth.
+    fn of(shadow: &ShadowSettings) -> Option<Self> {
+        let blur = shadow.blur;
+        if shadow.method == ShadowMethod::PercentageCloser {
+            return Some(Self { gathers: shadow.blur_radius() + 1, spacing: 2, blur });
+        }
+        // Texels beyond 2.5 standard deviations change a shadow edge by at most 0.6 %. Without them, the default blur
+        // needs 25 instead of 36 gathers.
+        let radius = (2.5 * f64::from(blur)).ceil() as u32;
+        let stride = radius.div_ceil(Self::MAX_FALLBACK_GATHERS - 1).max(1);
+        let kernel = Self { gathers: radius.div_ceil(stride) + 1, spacing: 2 * stride, blur };
+        shadow.filters_undecided_points().then_some(kernel)
+    }
+
+    /// GLSL constants. The weight of a texel at the distance d from the center is TAP_SCALE 2^(TAP_FALLOFF d^2) along
+    /// one axis; the weights of all texels sum to 1.
+    fn constants(&self) -> String {
+        let Self { gathers, spacing, blur } = *self;
+        // Without a blur, all texels except the center have a weight of 0 in f32.
+        let falloff = -0.5 * std::f64::consts::LOG2_E / f64::from(blur).powi(2).max(1e-4);
+        // A gather at x reads the texels x and x + 1.
+        let first = -(((gathers - 1) * spacing / 2) as i32);
+        let corners = (0..gathers).map(|index| first + (index * spacing) as i32);
+        let weight = |offset: i32| (falloff * f64::from(offset).powi(2)).exp2();
+        let sum: f64 = corners.map(|corner| weight(corner) + weight(corner + 1)).sum();
+        format!(
+            "const int GATHERS = {gathers}, GATHER_SPACING = {spacing};\n\
+             const float TAP_FALLOFF = {:?}, TAP_SCALE = {:?};\n",
+            falloff as f32,
+            (1.0 / sum) as f32,
+        )
+    }
+}
+
 impl ShaderOptions {
     /// GLSL function `sun_visibility`.
     pub(crate) fn sun_visibility(&self) -> String {
         let mut text = String::new();
         if let Some(shadow) = self.features.variance_shadow() {
             writeln!(text, "const float DEVIATION = {:?};", shadow.filter_deviation() as f32).ok();
+            writeln!(text, "const float ROUNDING_VARIANCE = {:?};", shadow.variance_floor()).ok();
         }
-        let percentage_closer = self.features.shadow.filter(|shadow| shadow.method == ShadowMethod::PercentageCloser);
-        if let Some(shadow) = percentage_closer {
-            let taps = gaussian_weights(shadow.blur);
-            writeln!(text, "#define RADIUS {}", taps.len() - 1).ok();
-            let tap_list: String = taps.iter().map(|weight| format!("{weight:?}, ")).collect();
-            // The shader also reads the tap after the last one.
-            writeln!(text, "const float TAPS[RADIUS + 2] = float[]({tap_list}0.0);").ok();
+        if let Some(kernel) = self.features.shadow.as_ref().and_then(PcfKernel::of) {
+            text += &kernel.constants();
         }
         text + self.cascade_source() + SUN_VISIBILITY
     }
@@ -270,6 +317,58 @@ mod tests {
         );
     }
 
+    /// Sums the weights as the shader does: each gather reads the texels x and x + 1, whose weights are interpolated
+    /// between Gaussians that are centered at the texels 0 and 1.
+    #[test]
+    fn pcf_weights_sum_to_one_at_every_position() {
+        for (method, blur) in [ShadowMethod::Variance, ShadowMethod::PercentageCloser]
+            .into_iter()
+            .flat_map(|method| [0.0, 0.3, 1.5, 6.0, 6.1, 16.0].map(|blur| (method, blur)))
+        {
+            let shadow = ShadowSettings { method, blur, ..ShadowSettings::default() };
+            let kernel = PcfKernel::of(&shadow).expect("a kernel");
+            let PcfKernel { gathers, spacing, .. } = kernel;
+            let skips_texels = spacing > 2;
+            assert_eq!(skips_texels, method == ShadowMethod::Variance && blur > 6.0, "{kernel:?}");
+            let constants = kernel.constants();
+            let constant = |name: &str| -> f64 {
+                let (_, value) = constants.split_once(&format!("{name} = ")).expect("a constant");
+                value.split([',', ';']).next().and_then(|value| value.parse().ok()).expect("a number")
+            };
+            let [falloff, scale] = ["TAP_FALLOFF", "TAP_SCALE"].map(constant);
+            let tap = |offset: f64| scale * (falloff * offset * offset).exp2();
+            let sum_at = |fraction: f64| -> f64 {
+                let first = -f64::from((gathers - 1) * spacing) / 2.0;
+                let corners = (0..gathers).map(|index| first + f64::from(index * spacing));
+                let texels = corners.flat_map(|corner| [corner, corner + 1.0]);
+                texels.map(|texel| (1.0 - fraction) * tap(texel) + fraction * tap(texel - 1.0)).sum()
+            };
+            for fraction in [0.0, 0.25, 0.5, 1.0] {
+                let sum = sum_at(fraction);
+                assert!((sum - 1.0).abs() < 1e-5, "{kernel:?}: expected a sum of 1, got {sum}");
+            }
+        }
+    }
+
+    #[test]
+    fn pcf_fallback_reads_a_limited_number_of_texels() {
+        let gathers = |blur: f32| {
+            let shadow = ShadowSettings { blur, ..ShadowSettings::default() };
+            PcfKernel::of(&shadow).map(|kernel| (kernel.gathers, kernel.spacing))
+        };
+        assert_eq!([0.0, 1.5, 6.0].map(gathers), [Some((1, 2)), Some((5, 2)), Some((16, 2))]);
+        for tenths in 0..=160 {
+            let (gathers, spacing) = gathers(tenths as f32 / 10.0).expect("a kernel");
+            // The gathers reach 2.5 standard deviations in both directions.
+            assert!(gathers <= PcfKernel::MAX_FALLBACK_GATHERS && (gathers - 1) * spacing >= tenths / 2, "{tenths}");
+        }
+        assert_eq!(
+            PcfKernel::of(&ShadowSettings { pcf_fallback: false, ..ShadowSettings::default() }),
+            None,
+            "no lookup filters the depth"
+        );
+    }
+
     #[test]
     fn sources_contain_only_features_of_the_scene() {
         let defines = ["SHADOW_VARIANCE", "SHADOW_STANDARD", "SHADOW_FILTERED"];
@@ -278,7 +377,9 @@ mod tests {
         {
             let shadow = ShadowSettings { method, ..ShadowSettings::default() };
             let features = |shadow| ShaderFeatures { shadow: Some(shadow), ..ShaderFeatures::NONE };
-            assert_eq!(features(shadow).defines(), ["SHADOWS", define]);
+            let fallback = (method == ShadowMethod::Variance).then_some("PCF_FALLBACK");
+            let expected_defines: Vec<&str> = ["SHADOWS", define].into_iter().chain(fallback).collect();
+            assert_eq!(features(shadow).defines(), expected_defines);
             let options = ShaderOptions {
                 features: features(shadow),
                 image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
@@ -288,11 +389,13 @@ mod tests {
                 sample_resolve: String::new(),
                 post_depth_coverage: false,
             };
-            assert_eq!(options.sun_visibility().contains("const float TAPS"), define == "SHADOW_FILTERED");
+            assert_eq!(options.sun_visibility().contains("const int GATHERS"), define != "SHADOW_STANDARD");
             assert!(
                 !options.sun_visibility().contains("CascadeBlock")
                     && !options.shadow(BlendMode::Opaque).stages[0].1.contains("CascadeBlock")
             );
+            let without_fallback = ShadowSettings { pcf_fallback: false, ..shadow };
+            assert_eq!(features(without_fallback).defines(), ["SHADOWS", define]);
             let cascaded = ShaderOptions { features: features(ShadowSettings { cascades: 3, ..shadow }), ..options };
             assert!(cascaded.sun_visibility().contains("CascadeBlock"));
             let four_cascades = features(ShadowSettings { cascades: 4, ..shadow });

@@ -23,6 +23,7 @@ use modalcast_render::{
 use nalgebra::{Matrix4, Vector3};
 
 use super::harness::{SceneBuilder, facing_rectangle, floor_mesh, open_renderer};
+use super::shadow_layers::LayerScene;
 
 /// The reference rasterizer. It reads and writes buffers of the current OpenGL context.
 struct ReferenceRasterizer {
@@ -248,12 +249,37 @@ fn compute_rasterized_frame_equals_opengl() {
     }
 }
 
+/// Pixels that the moments do not decide filter the compute rasterizer's depth, which the blur copies.
+#[test]
+fn overlapping_layers_equal_opengl_for_every_blur_method() {
+    for blur_method in [BlurMethod::Tiles, BlurMethod::Rows, BlurMethod::Fragments] {
+        let draw_frame = |backend, pcf_fallback| {
+            let mut renderer = open_renderer();
+            renderer.set_blur_method(blur_method);
+            let layers = LayerScene::roof_and_slab().with_shadow(|shadow| ShadowSettings { pcf_fallback, ..shadow });
+            draw_frame_with(&mut renderer, &layers.build(), layers.camera(SIZE[1]), backend)
+        };
+        let compute_frame = draw_frame(Backend::Compute(0.0), true);
+        assert!(compute_frame.allocations.iter().any(|name| name == "shadow depth, copied"));
+        let moments_only = draw_frame(Backend::Compute(0.0), false);
+        assert!(!moments_only.allocations.iter().any(|name| name == "shadow depth, copied"));
+        for (compute, pcf_fallback) in [(&compute_frame, true), (&moments_only, false)] {
+            let opengl = draw_frame(Backend::OpenGl, pcf_fallback);
+            let different_bytes = count_different_bytes(&compute.image, &opengl.image);
+            assert!(different_bytes <= 60, "{blur_method:?}, fallback {pcf_fallback}: {different_bytes} bytes differ");
+        }
+        let different_bytes = count_different_bytes(&compute_frame.image, &moments_only.image);
+        assert!(different_bytes > 300, "negative control: expected leaked light, {different_bytes} bytes differ");
+    }
+}
+
 /// The depths of the shadow map and the keys of the frame count against the budget of render targets.
 #[test]
 fn compute_rasterizer_without_memory_leaves_its_passes_to_opengl() {
     let shadow = ShadowSettings { size: 256, ..ShadowSettings::default() };
     let scene = yard_builder(Some(shadow), 1).build();
-    let output_bytes = 4 * 256 * 256 + 8 * u64::from(SIZE[0] * SIZE[1]);
+    // Depths, their copy, and keys.
+    let output_bytes = 2 * 4 * 256 * 256 + 8 * u64::from(SIZE[0] * SIZE[1]);
     // The frame, and the bytes that are reserved after its scene is unloaded, which are those of the target.
     let draw = |backend, bytes: u64| {
         let budget = MemoryBudget::new(MemoryKind::RenderTargets, bytes, bytes);

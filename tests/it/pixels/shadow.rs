@@ -211,6 +211,7 @@ fn unblurred_texel_gives_the_chebyshev_bound() {
             least_variance,
             bleeding,
             alpha_threshold: 0.0,
+            pcf_fallback: false,
             ..ShadowSettings::default()
         });
         let transparent_material = Material { alpha_mode: AlphaMode::Blend, alpha: 0.0, ..Material::default() };

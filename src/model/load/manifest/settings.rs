@@ -69,6 +69,7 @@ impl ShadowKeys {
             moments: self.moments.unwrap_or(default.moments),
             cascades: self.cascades.unwrap_or(default.cascades),
             fit: self.fit.unwrap_or(default.fit),
+            pcf_fallback: default.pcf_fallback,
         }
     }
 }
