@@ -14,6 +14,7 @@ use modalcast_model::scene::FrameSize;
 const WORKLOAD_HELP: &str = "Loads:
   square       a square that floats over the ground
   shelf        a shelf just above the ground, from nearby
+  layers       the shadow of three sheets above each other whose edges cross
   panes        three translucent panes, listed in the wrong order
   images       panels with images of many sizes, each repeated
   tree, grove  the built-in tree, and four of them

@@ -9,8 +9,8 @@
 //! over the workloads, so that all have the same weight.
 //!
 //! Standard maps are not candidates: they are not filtered, and the mean error does not show their jagged edges. The
-//! workload `shelf` is not used: its image shows only a few texels of the map, so its error depends on the width of the
-//! blur.
+//! workloads `shelf` and `layers` are not used: their images show only a few texels of the map, so their errors depend
+//! on the width of the blur.
 
 use serde::Serialize;
 
@@ -152,13 +152,15 @@ fn shipped_shadow(kind: RendererKind) -> ShadowSettings {
 /// Whether a row is a variant of the shadow map: it compares neither another feature nor an implementation of the blur.
 fn is_candidate(row: &RenderRow) -> bool {
     let has_default_parts = |shadow: ShadowSettings| {
-        shadow.bleeding == ShadowSettings::default().bleeding && shadow.moments == MomentFormat::F32
+        shadow.bleeding == ShadowSettings::default().bleeding
+            && shadow.moments == MomentFormat::F32
+            && shadow.pcf_fallback
     };
     row.shadow.is_some_and(|shadow| has_default_parts(shadow) && shadow.method != ShadowMethod::Standard)
         && row.blur_method == BlurMethod::Auto
         && !row.name.starts_with("culling")
         && row.culling == Culling::default()
-        && row.load != RenderWorkload::Shelf.name()
+        && ![RenderWorkload::Shelf, RenderWorkload::Layers].iter().any(|workload| row.load == workload.name())
 }
 
 #[cfg(test)]
@@ -222,6 +224,7 @@ mod tests {
         let other = |size| ShadowSettings { size, ..shipped };
         let standard = ShadowSettings { method: ShadowMethod::Standard, ..shipped };
         let f16 = ShadowSettings { moments: MomentFormat::F16, ..shipped };
+        let moments_only = ShadowSettings { pcf_fallback: false, ..shipped };
         let rows = |shipped_us| {
             vec![
                 // Faster, but above the limit on one workload.
@@ -232,15 +235,18 @@ mod tests {
                 // Slower on one workload, faster on the other; the geometric mean is 200.
                 row("tree", "large", other(999), 1000.0, 0.001),
                 row("square", "large", other(999), 40.0, 0.001),
-                // Not candidates: not filtered, not timed on a workload, another format, and a workload that is not
-                // used.
+                // Not candidates: not filtered, not timed on a workload, another format, no fallback, and a workload
+                // that is not used.
                 row("tree", "standard", standard, 1.0, 0.0),
                 row("square", "standard", standard, 1.0, 0.0),
                 row("tree", "untimed", other(77), 1.0, 0.0),
                 row("square", "untimed", other(77), 0.0, 0.0),
                 row("tree", "f16", f16, 1.0, 0.0),
                 row("square", "f16", f16, 1.0, 0.0),
+                row("tree", "moments only", moments_only, 1.0, 0.0),
+                row("square", "moments only", moments_only, 1.0, 0.0),
                 row("shelf", "shipped", shipped, 1.0, 0.9),
+                row("layers", "shipped", shipped, 1.0, 0.9),
             ]
         };
         let default = DefaultShadow::choose(&rows(100.0), &renderer(false), HARDWARE_SIZE).expect("candidates");

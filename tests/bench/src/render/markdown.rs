@@ -40,12 +40,13 @@ pub(super) fn markdown(report: &RenderReport) -> String {
 const EXPLANATION: &str = "Color errors are the largest difference of the three sRGB channels, 0 to 255. `color` \
 columns compare with hard shadow rays, `intended color` with the intended result of the variant: no shadow, a hard \
 shadow, or the hard shadow filtered by the blur's footprint. `intended light`, `penumbra` and `bleeding` compare the \
-sun visibility with the intended result; `bleeding` is the mean sun visibility in the umbra. `flicker` is the change \
+sun visibility with the intended result; `bleeding` is the mean sun visibility in the umbra, `leak` the largest sun \
+visibility above the intended one. `flicker` is the change \
 of the color error from step to step. `frame` is the time of all passes except the readback. `encode` converts linear \
 colors to sRGB bytes. Culling passes the `listed` triangles to the rasterizer; `hidden` triangles are occluded by the \
 triangles that were visible in the last frame.\n";
 
-const HEADER: [&str; 25] = [
+const HEADER: [&str; 26] = [
     "variant",
     "frame us",
     "quartiles us",
@@ -69,6 +70,7 @@ const HEADER: [&str; 25] = [
     "intended light mean",
     "penumbra",
     "bleeding",
+    "leak",
     "flicker mean",
     "passed",
 ];
@@ -102,7 +104,7 @@ fn workload_section<'a>(workload: &RenderWorkloadSummary, rows: impl Iterator<It
     text
 }
 
-fn row_cells(row: &RenderRow) -> [String; 25] {
+fn row_cells(row: &RenderRow) -> [String; 26] {
     let timing = |name: &str| row.passes.iter().find(|pass| pass.name == name).map(|pass| pass.timing);
     let median = |name: &str| timing(name).map_or_else(dash, |timing| format!("{:.1}", timing.median_us));
     let format_four_decimals = |value: f64| format!("{value:.4}");
@@ -133,6 +135,7 @@ fn row_cells(row: &RenderRow) -> [String; 25] {
         format_four_decimals(row.intended_light_errors.all_pixels.mean),
         format_four_decimals(row.intended_light_errors.penumbra.mean),
         row.intended_light_errors.umbra_visibility.map_or_else(dash, format_four_decimals),
+        format_four_decimals(row.intended_light_errors.max_leak),
         match (row.flicker, &row.flicker_skip_reason) {
             (Some(flicker), _) => format!("{:.3}", flicker.mean),
             (None, Some(reason)) => format!("skipped: {reason}"),

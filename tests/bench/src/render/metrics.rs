@@ -57,6 +57,9 @@ pub struct LightErrors {
     #[serde(rename = "in_umbra")]
     pub umbra_visibility: Option<f64>,
     pub umbra_pixels: usize,
+    /// Largest rendered minus reference, 0 if no pixel is too bright: the brightest light that bleeds into a shadow.
+    #[serde(rename = "leak")]
+    pub max_leak: f64,
     /// Mean missing sun visibility where the reference has no shadow. `None` without such pixels.
     #[serde(rename = "lost")]
     pub lost_visibility: Option<f64>,
@@ -83,6 +86,7 @@ pub fn compare_light(rendered: &[Option<f32>], reference: &[Option<f32>]) -> Lig
         penumbra: ErrorDistribution::from_values(pairs.iter().filter(is_penumbra).map(error).collect()),
         umbra_visibility: mean(&umbra_visibilities),
         umbra_pixels: umbra_visibilities.len(),
+        max_leak: f64::from(pairs.iter().map(|(rendered, reference)| rendered - reference).fold(0.0, f32::max)),
         lost_visibility: mean(&missing_visibilities),
         bias: bias / pairs.len().max(1) as f64,
     }

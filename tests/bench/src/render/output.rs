@@ -19,10 +19,11 @@ use modalcast_model::error::{Result, fault_in};
 /// - `of_aim`: errors against the intended result: no shadow, a hard shadow, or a hard shadow with the variant's blur
 /// - `bleeding`, `penumbra`, `lost`: mean sun visibility in the umbra, errors in the penumbra, and mean missing sun
 ///   visibility where there is no shadow; all against the intended result
+/// - `leak`: largest sun visibility above that of the intended result
 /// - `to_fail`: whether the variant is expected to exceed its limits
 /// - `no_flicker`: why flicker was not measured
 /// - `listed`, `hidden`: triangles that are passed to the rasterizer, and triangles that are occluded
-const COLUMNS: [(&str, &str); 55] = [
+const COLUMNS: [(&str, &str); 56] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -73,6 +74,7 @@ const COLUMNS: [(&str, &str); 55] = [
     ("penumbra_p99", "/light_of_aim/penumbra/p99"),
     ("penumbra_pixels", "/light_of_aim/penumbra/count"),
     ("bleeding", "/light_of_aim/in_umbra"),
+    ("leak", "/light_of_aim/leak"),
     ("lost", "/light_of_aim/lost"),
     ("flicker_mean", "/flicker/mean"),
     ("flicker_p99", "/flicker/p99"),

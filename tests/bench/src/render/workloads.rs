@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `square` | a square that floats above the ground; its umbra and penumbra are known |
 //! | `shelf` | the narrow shadow of a square just above the ground, at one end of the shadow map's depth range |
+//! | `layers` | three sheets above each other whose edges cross, and a floor below them that is mostly in full shadow |
 //! | `panes` | three translucent panes in front of an opaque wall, listed from nearest to farthest |
 //! | `images` | panels with images of many sizes, each repeated |
 //! | `tree` | the built-in tree |
@@ -32,6 +33,7 @@ use modalcast_model::scene::{Antialiasing, Camera, Lens, RenderSettings, Scene, 
 pub enum RenderWorkload {
     Square,
     Shelf,
+    Layers,
     Panes,
     Images,
     Tree,
@@ -67,7 +69,7 @@ impl RenderWorkload {
     /// Every workload, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
         let field = Self::Triangles(if quick { QUICK_FIELD_TRIANGLES } else { FULL_FIELD_TRIANGLES });
-        vec![Self::Square, Self::Shelf, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
+        vec![Self::Square, Self::Shelf, Self::Layers, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
     }
 
     /// The workload with this name.
@@ -78,6 +80,7 @@ impl RenderWorkload {
         let workload = match name {
             "square" => Some(Self::Square),
             "shelf" => Some(Self::Shelf),
+            "layers" => Some(Self::Layers),
             "panes" => Some(Self::Panes),
             "images" => Some(Self::Images),
             "tree" => Some(Self::Tree),
@@ -87,7 +90,8 @@ impl RenderWorkload {
                 triangle_count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
             }
         };
-        let expected = format!("square, shelf, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
+        let expected =
+            format!("square, shelf, layers, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
         workload.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -96,6 +100,7 @@ impl RenderWorkload {
         match self {
             Self::Square => "square".into(),
             Self::Shelf => "shelf".into(),
+            Self::Layers => "layers".into(),
             Self::Panes => "panes".into(),
             Self::Images => "images".into(),
             Self::Tree => "tree".into(),
@@ -113,6 +118,7 @@ impl RenderWorkload {
         let (scene, sliding_domain) = match self {
             Self::Square => (Scene::new(build_square()?)?, Some(1)),
             Self::Shelf => (Scene::new(build_shelf()?)?, None),
+            Self::Layers => (Scene::new(build_layers()?)?, None),
             Self::Panes => (Scene::new(build_panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
             Self::Tree => (open_tree()?, None),
@@ -130,8 +136,8 @@ impl AnimatedScene {
         Self { name: deform_workload.name, workload, scene: deform_workload.scene, motion, sliding_domain }
     }
 
-    /// The camera of the workload's images. It frames the whole scene, except for `shelf` and `images`. A `near` and
-    /// `far` of 0 are fitted to the scene.
+    /// The camera of the workload's images. It frames the whole scene, except for `shelf`, `layers` and `images`. A
+    /// `near` and `far` of 0 are fitted to the scene.
     pub(super) fn camera(&self, size: Size) -> Camera {
         match self.workload {
             // The shadow fills half of the image.
@@ -139,6 +145,11 @@ impl AnimatedScene {
                 let point = |height: f64| [f64::from(SHELF_EDGE) - 0.06, height, 0.0];
                 let view = View::LookAt { eye: point(2.0), target: point(0.0), up: [0.0, 0.0, -1.0] };
                 Camera { view, lens: Lens::FieldOfView(2.9), near: 0.0, far: 0.0 }
+            }
+            // From between the floor and the lowest sheet down to where the edges cross. The image is 0.24 units high.
+            RenderWorkload::Layers => {
+                let view = View::LookAt { eye: [0.0, 0.28, 0.0], target: [0.0; 3], up: [0.0, 0.0, -1.0] };
+                Camera { view, lens: Lens::FieldOfView(46.4), near: 0.0, far: 0.0 }
             }
             // The panels fill the image; the floor extends beyond it.
             RenderWorkload::Images => {
@@ -281,6 +292,30 @@ fn build_shelf() -> Result<SceneParts> {
         two_sided_material([0.80, 0.35, 0.25]),
     )?;
     parts.look = RenderSettings { sun: [3.0, 1.0, 0.0], ..RenderSettings::default() };
+    Ok(parts)
+}
+
+/// Builds a floor of four units and three horizontal sheets above it, whose shadows have edges that cross near the
+/// center of the floor. The highest sheet is ten times as high as the lowest one, which covers most of the image: along the
+/// shadow edges of the higher sheets, moments alone leak light into its shadow. Between the edges, a wedge is lit.
+fn build_layers() -> Result<SceneParts> {
+    const SUN: [f32; 3] = [0.1, 1.0, 0.05];
+    const HALF_SIDE: f32 = 0.9;
+    let mut parts = SceneParts::named("layers");
+    add_rigid_domain(&mut parts, "floor", horizontal_square(2.0, 0.0)?, two_sided_material([0.75, 0.72, 0.68]))?;
+    // The shadow of a sheet covers the points p of the floor with p . (cos angle, sin angle) <= offset in x and z.
+    for (name, height, angle, offset) in
+        [("low", 0.3, 0.0, 0.06), ("middle", 1.0, -1.2, -0.05), ("high", 3.0, 1.4_f32, 0.0_f32)]
+    {
+        let (sin, cos) = angle.sin_cos();
+        let point = |u: f32, v: f32| {
+            let (across, along) = (offset + HALF_SIDE * (u - 1.0), HALF_SIDE * v);
+            [across * cos - along * sin + height * SUN[0], height, across * sin + along * cos + height * SUN[2]]
+        };
+        let sheet = quad([point(-1.0, 1.0), point(1.0, 1.0), point(1.0, -1.0), point(-1.0, -1.0)], [0.0, 1.0, 0.0])?;
+        add_rigid_domain(&mut parts, name, sheet, two_sided_material([0.80, 0.35, 0.25]))?;
+    }
+    parts.look = RenderSettings { sun: SUN, ..RenderSettings::default() };
     Ok(parts)
 }
 
