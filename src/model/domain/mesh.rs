@@ -105,12 +105,19 @@ impl Mesh {
     /// The rest positions of the vertices that triangles use, one per use. Only these vertices are drawn: bounds,
     /// ground and cameras ignore the others.
     pub fn drawn_positions(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
-        self.drawn_vertices().map(|vertex| self.rest_positions[vertex])
+        self.used_vertices().map(|vertex| self.rest_positions[vertex])
     }
 
-    /// The vertices that triangles use, with repetitions.
-    pub(crate) fn drawn_vertices(&self) -> impl Iterator<Item = usize> + '_ {
+    /// The vertices of the triangles, with repetitions.
+    fn used_vertices(&self) -> impl Iterator<Item = usize> + '_ {
         self.triangles.as_flattened().iter().map(|corner| self.corners.vertices[*corner as usize] as usize)
+    }
+
+    /// The vertices that triangles use, ascending and without repetitions.
+    pub(crate) fn drawn_vertices(&self) -> Vec<u32> {
+        let mut is_drawn = vec![false; self.rest_positions.len()];
+        self.used_vertices().for_each(|vertex| is_drawn[vertex] = true);
+        (0..).zip(is_drawn).filter_map(|(vertex, is_drawn)| is_drawn.then_some(vertex)).collect()
     }
 
     /// The same mesh with other rest positions, one per vertex.

@@ -21,7 +21,7 @@ pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
 pub use rest_origin::{MAX_DIAGONALS, RestOrigin};
-pub(crate) use rest_origin::{origin_of_bounds, power_of_two_at_most, snap_to_grid};
+pub(crate) use rest_origin::{origin_of_bounds, origin_of_positions, power_of_two_at_most, snap_to_grid};
 pub use smoothing_groups::{MAX_RING_TRIANGLES, RING_START, SmoothingGroups};
 pub use texture::Texture;
 pub use transform::Transform;

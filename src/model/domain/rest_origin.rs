@@ -21,17 +21,22 @@ impl RestOrigin {
     /// of the diagonal of their bounds, else a point near the center of these bounds. `drawn` are the indices of the
     /// vertices that triangles use, with repetitions. Indices beyond the positions are ignored.
     pub fn choose(positions: &[[f64; 3]], drawn: impl IntoIterator<Item = usize>) -> Self {
-        let mut bounds = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
-        for position in drawn.into_iter().filter_map(|vertex| positions.get(vertex)) {
-            for axis in 0..3 {
-                bounds[0][axis] = bounds[0][axis].min(position[axis]);
-                bounds[1][axis] = bounds[1][axis].max(position[axis]);
-            }
-        }
-        let origin = origin_of_bounds(bounds);
+        let origin = origin_of_positions(drawn.into_iter().filter_map(|vertex| positions.get(vertex)));
         let relative = |position: &[f64; 3]| std::array::from_fn(|axis| (position[axis] - origin[axis]) as f32);
         Self { origin, positions: positions.iter().map(relative).collect() }
     }
+}
+
+/// The origin of positions, as [`RestOrigin::choose`] chooses it.
+pub(crate) fn origin_of_positions<'a>(positions: impl IntoIterator<Item = &'a [f64; 3]>) -> [f64; 3] {
+    let mut bounds = [[f64::INFINITY; 3], [f64::NEG_INFINITY; 3]];
+    for position in positions {
+        for axis in 0..3 {
+            bounds[0][axis] = bounds[0][axis].min(position[axis]);
+            bounds[1][axis] = bounds[1][axis].max(position[axis]);
+        }
+    }
+    origin_of_bounds(bounds)
 }
 
 /// The origin of positions with these bounds (minimum and maximum): zero if f32 suffices without an origin. Its

@@ -16,7 +16,7 @@ use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::polygons::{Corner, PolygonMesh};
 use super::surface::{self, ModelOptions};
 use super::text::{lines, without_byte_order_mark};
-use crate::domain::{Material, RestOrigin};
+use crate::domain::{Material, origin_of_positions};
 use crate::error::{Result, invalid};
 use crate::memory::TemporaryReservation;
 use crate::scene::{SceneParts, UpAxis};
@@ -139,7 +139,7 @@ fn parse_text(bytes: &[u8], merger: &mut VertexMerger) -> Result<()> {
     if is_in_loop {
         return Err(invalid("end", "endloop", "the end of the file"));
     }
-    merger.origin = RestOrigin::choose(&positions, 0..positions.len()).origin;
+    merger.origin = origin_of_positions(&positions);
     for (vertices, line) in positions.as_chunks::<3>().0.iter().zip(line_numbers) {
         merger.add_triangle(*vertices, line).map_err(|error| error.prefix_field(&format!("line {line}")))?;
     }

@@ -146,14 +146,11 @@ fn world_from_shape(scene: &Scene, state: &SceneState, domain: usize) -> Matrix4
 
 /// Per mode and axis, the largest magnitude in U of the drawn vertices.
 fn mode_reach(shape: &Shape) -> Vec<[f64; 3]> {
-    let mut is_drawn = vec![false; shape.mesh.rest_positions().len()];
-    let corners = &shape.mesh.corners().vertices;
-    let drawn = shape.mesh.triangles().as_flattened().iter().map(|corner| corners[*corner as usize] as usize);
-    drawn.for_each(|vertex| is_drawn[vertex] = true);
+    let drawn_vertices = shape.mesh.drawn_vertices();
     let reach_of = |mode: usize| {
         let mut reach = [0.0_f64; 3];
-        let rows = shape.modes.column(mode).as_chunks::<3>().0.iter().zip(&is_drawn);
-        for (row, _) in rows.filter(|(_, is_drawn)| **is_drawn) {
+        let rows = shape.modes.column(mode).as_chunks::<3>().0;
+        for row in drawn_vertices.iter().map(|vertex| rows[*vertex as usize]) {
             (0..3).for_each(|axis| reach[axis] = reach[axis].max(f64::from(row[axis].abs())));
         }
         reach

@@ -3,8 +3,7 @@
 //!
 //! Such a scene differs from others in two ways. Rest positions are relative to an origin of their shape
 //! ([`Shape::origin`]), which is a part of the transforms of the state ([`super::TransformRoots::pivot_of`]). And the
-//! rest state has
-//! [`super::FloatingOrigins`], as after a step with f64 translations. All other scenes have neither.
+//! rest state has [`super::FloatingOrigins`], as after a step with f64 translations. All other scenes have neither.
 
 use nalgebra::{Matrix4, Point3};
 
@@ -62,19 +61,43 @@ impl Extents {
     }
 }
 
-/// Decides which domains are far, and removes the origins of the shapes and the remainders of the placements that do
-/// not matter. Centers shapes that are far without having an origin. Returns a remark if steps with f32 transforms would
-/// misplace a domain by more than the promised accuracy.
+/// The domains of a scene that are far.
+pub(super) struct FarDomains {
+    /// Per domain.
+    is_far: Vec<bool>,
+    /// A remark, if steps with f32 transforms would misplace a domain by more than the promised accuracy.
+    pub(super) remark: Option<String>,
+}
+
+impl FarDomains {
+    /// Whether any domain is far.
+    pub(super) fn exist(&self) -> bool {
+        self.is_far.contains(&true)
+    }
+
+    /// Rounds the placements of the other domains to f32.
+    pub(super) fn round_near_placements(&self, domains: &mut [Domain]) {
+        for (domain, is_far) in domains.iter_mut().zip(&self.is_far) {
+            if !is_far {
+                domain.placement_remainder = [0.0; 12];
+            }
+        }
+    }
+}
+
+/// Decides which domains are far, and removes the origins of the shapes that do not matter. Centers shapes that are far
+/// without having an origin.
 ///
 /// # Errors
 /// `Invalid` if a position exceeds the range of f32.
-pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<String>> {
+pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<FarDomains> {
     let SceneParts { shapes, domains, .. } = parts;
     let extents = Extents::new(shapes, domains);
     let mut is_far_shape = vec![false; shapes.len()];
+    let mut is_far_domain = vec![false; domains.len()];
     // Domains that steps with f32 transforms misplace: the index and the largest coordinate of each.
     let mut misplaced: Vec<(usize, f64)> = Vec::new();
-    for (index, domain) in domains.iter_mut().enumerate() {
+    for (index, domain) in domains.iter().enumerate() {
         let limit = extents.largest_coordinate(index);
         // A scene of a single point has no size to compare with.
         let is_far = |reach: f64| limit.is_normal() && reach.is_finite() && reach > limit;
@@ -83,9 +106,8 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<Stri
         let shape_reach = scale * largest_coordinate(extents.shapes[domain.shape]);
         let reach = shape_reach.max(largest_coordinate(extents.domains[index]));
         is_far_shape[domain.shape] |= is_far(shape_reach);
-        if !is_far(reach) {
-            domain.placement_remainder = [0.0; 12];
-        } else if F32_TRANSFORM_ERROR * reach > extents.tolerated_error(index) {
+        is_far_domain[index] = is_far(reach);
+        if is_far(reach) && F32_TRANSFORM_ERROR * reach > extents.tolerated_error(index) {
             misplaced.push((index, reach));
         }
     }
@@ -99,7 +121,7 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<Option<Stri
             shape.set_origin(origin)?;
         }
     }
-    Ok(far_remark(parts, &misplaced))
+    Ok(FarDomains { is_far: is_far_domain, remark: far_remark(parts, &misplaced) })
 }
 
 /// A remark on the error of steps with f32 transforms, in a scene where it matters.

@@ -72,6 +72,10 @@ pub const MAX_DOMAINS: usize = 1 << 20;
 /// [`MAX_MATERIAL_RANGES`] and [`MAX_ATTACHMENT_VERTICES`], it keeps each description within one gRPC message.
 const MAX_NAME_BYTES: usize = 4 << 10;
 
+/// The largest number of remarks, and of characters of each.
+const MAX_REMARKS: usize = 256;
+const MAX_REMARK_CHARACTERS: usize = 1000;
+
 /// The largest number of material ranges of a domain.
 const MAX_MATERIAL_RANGES: usize = 65_536;
 
@@ -178,19 +182,21 @@ impl Scene {
         }
         let mut transform_roots = TransformRoots::new(&parts.shapes, &mut parts.domains)?;
         let had_origins = parts.shapes.iter().any(Shape::is_centered);
-        let far_remark = far_domains::separate_far_domains(&mut parts)?;
-        let is_far = far_remark.is_some();
+        let far_domains = far_domains::separate_far_domains(&mut parts)?;
+        let is_far = far_domains.exist();
         if is_far || had_origins {
             // The frames of followers depend on the origins of shapes.
             transform_roots = TransformRoots::new(&parts.shapes, &mut parts.domains)?;
         }
+        far_domains.round_near_placements(&mut parts.domains);
         // Parts of a scene already have its remark.
-        parts.remarks.extend(far_remark.filter(|remark| !parts.remarks.contains(remark)));
+        parts.remarks.extend(far_domains.remark.filter(|remark| !parts.remarks.contains(remark)));
         parts.look.check()?;
         drop_textures_without_uvs(&mut parts);
         parts.remarks.extend(negative_eigenvalues(&parts.domains));
         parts.remarks.extend(slow_eigenvalues(&parts.domains));
         add_tangents(&mut parts);
+        limit_remarks(&mut parts.remarks);
         let layout = Layout::new(&parts.shapes, &parts.domains)?;
         let features = SceneFeatures::from_parts(&parts);
         let origin_grids = Arc::new(OriginGrids::new(&parts.shapes, &parts.domains, &transform_roots));
@@ -247,10 +253,11 @@ impl Scene {
         let mut bounds = BoundingBox::EMPTY;
         let is_deformed = self.domains.iter().any(|domain| !domain.rest_q.is_empty());
         let rest_state = is_deformed.then(|| SceneState::rest(self));
+        let drawn_vertices: Vec<Vec<u32>> = self.shapes.iter().map(|shape| shape.mesh.drawn_vertices()).collect();
         for (index, domain) in self.domains.iter().enumerate() {
             let (world_from_domain, shape) = (domain.placement_matrix(), &self.shapes[domain.shape]);
             let rest_q = rest_state.as_ref().map_or(&[][..], |state| state.q_of(self, index));
-            for vertex in shape.mesh.drawn_vertices() {
+            for vertex in drawn_vertices[domain.shape].iter().map(|vertex| *vertex as usize) {
                 let x0 = shape.mesh.rest_positions()[vertex];
                 let displacement = |axis: usize| -> f64 {
                     let modes = rest_q.iter().enumerate().filter(|(_, q)| **q != 0.0);
@@ -261,6 +268,22 @@ impl Scene {
             }
         }
         bounds
+    }
+}
+
+/// Limits number and length of the remarks, and removes control characters: remarks contain texts of files, which may be
+/// written to make trouble in a terminal or a log.
+fn limit_remarks(remarks: &mut Vec<String>) {
+    let suppressed = remarks.len().saturating_sub(MAX_REMARKS);
+    remarks.truncate(MAX_REMARKS);
+    for remark in remarks.iter_mut() {
+        if remark.chars().nth(MAX_REMARK_CHARACTERS).is_some() {
+            *remark = remark.chars().take(MAX_REMARK_CHARACTERS).chain("...".chars()).collect();
+        }
+        remark.retain(|character| !character.is_control());
+    }
+    if suppressed > 0 {
+        remarks.push(format!("and {suppressed} more remarks"));
     }
 }
 

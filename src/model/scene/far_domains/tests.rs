@@ -200,6 +200,10 @@ fn remark_is_due_above_the_promised_error() {
         let size = BoundingBox::from_positions(&x0.iter().flatten().map(|number| *number as f32).collect::<Vec<_>>());
         let scene = scene_of(&[tetrahedron([distance * size.diagonal(), 0.0, 0.0])]);
         assert_eq!(scene.is_far, distance > 8.5, "{distance}");
+        let x0 = tetrahedron([distance * size.diagonal(), 0.0, 0.0]);
+        let expected = expected_positions(&scene, 0, &x0, 0.0, &Matrix4::identity());
+        let error = relative_error(&computed_positions(&scene, &SceneState::rest(&scene), 0), &expected);
+        assert!(error <= MAX_ERROR, "{distance}: {error:e}");
         assert_eq!(scene.remarks.len(), usize::from(has_remark), "{distance}: {:?}", scene.remarks);
     }
 }
