@@ -1,8 +1,9 @@
 //! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
 //!
 //! Programs without ambient light write a gray as Ka, such as black, white or 0.2 of any Kd, so a gray also means Kd. A
-//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd. `illum 0` and `illum 1` have no highlight. Neither has an exponent Ns
-//! that is missing or below 1, with which the highlight would cover the whole lit side; files use 0 for "not specified".
+//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd. There is no highlight with
+//! `illum 0` and `illum 1`, or with an exponent Ns that is missing or below 1, with which the highlight would cover the
+//! whole lit side; files use 0 for "not specified".
 
 use super::mtl::MtlMaterial;
 use crate::domain::{AlphaMode, Material, Texture};

@@ -4,7 +4,7 @@ mod material;
 mod mtl;
 mod parse;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 
 pub(super) use material::DEFAULT_ALPHA_CUTOFF;
 use parse::ObjFile;
@@ -66,14 +66,21 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
     let mut texture_cache = TextureCache::default();
     let mut statements_by_name = BTreeMap::new();
     let mut has_all_libraries = true;
+    let (mut references, mut read_paths) = (HashSet::new(), HashSet::new());
     for library in &obj.libraries {
         for reference in library_references(files, library) {
+            if !references.insert(reference) {
+                continue;
+            }
             let subject = format!("material library '{reference}'");
             let path = files.find_referenced(reference, &subject, MISSING_LIBRARY, &mut parts.remarks)?;
             let Some(path) = path else {
                 has_all_libraries = false;
                 continue;
             };
+            if !read_paths.insert(path.clone()) {
+                continue;
+            }
             let library_statements = mtl::parse(&files.read(&path, MAX_TEXT_BYTES)?);
             let library_statements =
                 library_statements.map_err(|error| error.prefix_field(&format!("file '{path}'")))?;
@@ -123,7 +130,7 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
 fn library_references<'a>(files: &AssetDir, statement: &'a str) -> Vec<&'a str> {
     let is_exact = |reference: &str| matches!(files.locate(reference), ReferencedFile::Exact(_));
     let is_found = |reference: &str| !matches!(files.locate(reference), ReferencedFile::Missing { .. });
-    let words: Vec<&str> = statement.split_ascii_whitespace().collect();
+    let words: Vec<&str> = statement.split_ascii_whitespace().take(parse::MAX_LIBRARIES).collect();
     let is_whole = words.len() < 2 || is_exact(statement);
     let is_list = |words: &[&str]| {
         words.iter().any(|word| is_exact(word)) || (!is_found(statement) && words.iter().any(|word| is_found(word)))
@@ -251,6 +258,21 @@ mod tests {
                 parts.remarks,
                 remarks.iter().map(|remark| format!("material library {remark}")).collect::<Vec<_>>()
             );
+        }
+    }
+
+    /// Otherwise, lines of a few bytes could cause any number of remarks, and read a library as often.
+    #[test]
+    fn repeated_libraries_are_read_and_remarked_once() {
+        let folder = create_folder(&[("a.mtl", "newmtl a\nKd 1 0 0\n")]);
+        let files = AssetDir::unrestricted(folder.path());
+        let words = "no.mtl a.mtl ".repeat(100_000);
+        for statements in ["mtllib no.mtl a.mtl\n".repeat(1000), format!("mtllib {words}\n")] {
+            let obj = ObjFile::parse(format!("{statements}{TRIANGLE}usemtl a\nf 1 2 3\n").as_bytes(), None);
+            let mut parts = SceneParts::named("a");
+            add_materials(&obj.expect("a valid file"), &files, &mut parts).expect("a library");
+            assert_eq!(parts.materials[0].diffuse, [1.0, 0.0, 0.0]);
+            assert_eq!(parts.remarks.len(), 1, "{:?}", parts.remarks);
         }
     }
 

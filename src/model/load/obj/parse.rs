@@ -11,6 +11,8 @@ use crate::load::text::{lines, without_byte_order_mark};
 use crate::load::values::{CorrectedValue, MISSING_COLOR};
 use crate::memory::TemporaryReservation;
 
+/// The largest number of material libraries of a file.
+pub(super) const MAX_LIBRARIES: usize = 256;
 /// The largest number of remarks on unsupported statements, one per key.
 const MAX_REMARKS: usize = 16;
 
@@ -84,12 +86,19 @@ impl Parser {
             }
             b"f" => self.add_face(words, line_number)?,
             b"usemtl" => (self.current_material, self.current_index) = (text_after_key(line), None),
-            b"mtllib" => self.obj.libraries.push(text_after_key(line)),
+            b"mtllib" => self.add_libraries(text_after_key(line)),
             // Groups and smoothing groups do not affect geometry: normals come from the file or are computed.
             b"o" | b"g" | b"s" => {}
             other => *self.unsupported_counts.entry(String::from_utf8_lossy(other).into_owned()).or_default() += 1,
         }
         Ok(())
+    }
+
+    /// Adds an `mtllib` statement unless an earlier one is equal, up to [`MAX_LIBRARIES`].
+    fn add_libraries(&mut self, statement: String) {
+        if self.obj.libraries.len() < MAX_LIBRARIES && !self.obj.libraries.contains(&statement) {
+            self.obj.libraries.push(statement);
+        }
     }
 
     /// The index of the current material. The first face with a material adds it to the list.
