@@ -6,8 +6,8 @@
 //! | position of another vertex | | | replaced, remark |
 //! | normal | normalized | normalized | computed from the faces, remark |
 //! | texture coordinates | | | (0, 0), remark |
-//! | color of a vertex, 0 to 1 | clamped | clamped, remark | white, remark |
-//! | colors of vertices, 0 to 255: half of the channels above 0 are above 2 | clamped | clamped, remark | white, remark |
+//! | color of a vertex or face, 0 to 1 | clamped | clamped, remark | white, remark |
+//! | colors of vertices or faces, 0 to 255: half of the channels above 0 are above 2 | clamped | clamped, remark | white, remark |
 //! | color, opacity or factor of a material, 0 to 1 | clamped | clamped, remark | default, remark |
 //! | exponent of a material, 0 to 1e6 | clamped | clamped, remark | default, remark |
 //! | displacement of a vertex that a face uses (morph target, U) | | | error with the vertex |
@@ -148,11 +148,22 @@ impl Corrections {
 
     /// Converts the colors of all vertices to a range from 0 to 1.
     pub(super) fn vertex_colors(&mut self, colors: &mut [[f32; 3]], first_index: u64) {
+        self.colors(["vertex", "vertices"], colors, first_index);
+    }
+
+    /// Converts the colors of all faces to a range from 0 to 1.
+    pub(super) fn face_colors(&mut self, colors: &mut [[f32; 3]]) {
+        self.colors(["face", "faces"], colors, 0);
+    }
+
+    /// `names` are the singular and the plural of the elements that have the colors.
+    fn colors(&mut self, names: [&str; 2], colors: &mut [[f32; 3]], first_index: u64) {
+        let [element, elements] = names;
         let channels = || colors.as_flattened().iter().filter(|channel| channel.is_finite() && **channel > 0.0);
         let large_count = channels().filter(|channel| **channel > MAX_UNIT_CHANNEL).count();
         let scale = if large_count > 0 && 2 * large_count >= channels().count() { 255.0 } else { 1.0 };
         if scale > 1.0 {
-            self.add_note("colors of vertices are divided by 255, because they exceed 1".into());
+            self.add_note(format!("colors of {elements} are divided by 255, because they exceed 1"));
         }
         for (index, color) in colors.iter_mut().enumerate() {
             if *color == MISSING_COLOR {
@@ -163,10 +174,12 @@ impl Corrections {
             let is_correct = |(channel, limited): (&f32, &f32)| (channel - limited).abs() <= ROUNDING * scale;
             if !color.iter().zip(&limited).all(is_correct) {
                 let is_finite = limited.iter().all(|channel| channel.is_finite());
-                let treatment = if is_finite { "the channels are clamped" } else { "the vertex is white" };
-                let place = format!("vertex {}", index as u64 + first_index);
+                let white = format!("the {element} is white");
+                let treatment = if is_finite { "the channels are clamped" } else { &white };
+                let place = format!("{element} {}", index as u64 + first_index);
                 let expected = format!("0 to {scale}");
-                self.add("color of a vertex", treatment, || CorrectedValue::new(place, expected, format!("{color:?}")));
+                let subject = format!("color of a {element}");
+                self.add(&subject, treatment, || CorrectedValue::new(place, expected, format!("{color:?}")));
             }
             let is_finite = limited.iter().all(|channel| channel.is_finite());
             *color = if is_finite { limited.map(|channel| channel / scale) } else { [1.0; 3] };

@@ -31,8 +31,8 @@ pub(super) struct PlyFace {
     pub(super) uvs: Vec<f32>,
     /// Index of the image of the face.
     pub(super) texture: Option<f64>,
-    /// 0 to 255.
-    pub(super) color: [f64; 3],
+    /// As [`PlyVertex::color`].
+    pub(super) color: [f32; 3],
 }
 
 /// An element that is not used.
@@ -68,7 +68,7 @@ impl PlyElement for PlyFace {
         if name == "texnumber" {
             self.texture = Some(value);
         } else if let Some(channel) = ["red", "green", "blue"].iter().position(|channel| *channel == name) {
-            self.color[channel] = 255.0 * value / full;
+            self.color[channel] = (value / full) as f32;
         }
     }
 

@@ -77,6 +77,8 @@ fn set_image(material: &mut Material, files: &AssetDir, image: &str, parts: &mut
 #[derive(Debug, Default)]
 struct PlyReader {
     polygons: PolygonMesh,
+    /// One per face, as in the file; empty if the faces have no colors.
+    face_colors: Vec<[f32; 3]>,
     remarks: Vec<String>,
 }
 
@@ -109,6 +111,9 @@ impl PlyReader {
             let vertex_count = self.polygons.positions.len();
             return Err(invalid("element face", "at least one face", format!("{vertex_count} vertices, no face")));
         }
+        self.polygons.corrections.face_colors(&mut self.face_colors);
+        let bytes = |color: [f32; 3]| Some(color.map(|channel| (255.0 * channel).round() as u8));
+        self.polygons.face_colors = std::mem::take(&mut self.face_colors).into_iter().map(bytes).collect();
         self.polygons.validate(|face| format!("face {face}"), 0)
     }
 
@@ -160,8 +165,8 @@ impl PlyReader {
             .add_face(face.vertices.iter().enumerate().map(corner), material, index)
             .map_err(|error| error.prefix_field(&field()))?;
         // A face of a line or a point is not added.
-        if definition.properties.contains_key("red") && polygons.faces.len() > polygons.face_colors.len() {
-            polygons.face_colors.push(Some(face.color.map(|channel| channel.round() as u8)));
+        if definition.properties.contains_key("red") && polygons.faces.len() > self.face_colors.len() {
+            self.face_colors.push(face.color);
         }
         Ok(())
     }

@@ -118,7 +118,8 @@ impl PolygonMesh {
     /// Reserves the memory of the lists.
     fn reserve_lists(&mut self) -> Result<()> {
         let Some(memory) = &mut self.memory else { return Ok(()) };
-        let vectors = self.normals.len() + self.colors.len();
+        // A color of a face has 4 bytes, and its value in a PLY file 12.
+        let vectors = self.normals.len() + self.colors.len() + 2 * self.face_colors.len();
         let bytes = list_bytes(self.positions.len(), vectors, self.uvs.len(), self.faces.len(), self.corners.len());
         // Half as much again, so that the reservation grows rarely.
         if bytes > memory.bytes() { memory.grow_to(bytes + bytes / 2) } else { Ok(()) }
