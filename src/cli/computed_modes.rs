@@ -18,6 +18,7 @@ use super::modeling_options::ModelingOptions;
 use super::serve::TerminationSignals;
 use super::{Completion, print_line, sibling};
 use modalcast_model::error::{Error, Result, fault, fault_in};
+use modalcast_model::load;
 
 /// Limit on the size of all entries of the cache in bytes.
 const MAX_CACHE_BYTES: u64 = 2 << 30;
@@ -223,7 +224,7 @@ fn referenced_files(path: &Path) -> Vec<PathBuf> {
         (Some("obj"), true) => {
             let text = fs::read(path).unwrap_or_default();
             let lines = text.split(|byte| *byte == b'\n').filter_map(|line| line.trim_ascii().strip_prefix(b"mtllib"));
-            let names = lines.map(|names| String::from_utf8_lossy(names.trim_ascii()).replace('\\', "/"));
+            let names = lines.map(|names| String::from_utf8_lossy(names.trim_ascii()).into_owned());
             // A line has several names, or one with spaces.
             names.flat_map(|names| std::iter::once(names.clone()).chain(words_of(&names)).collect::<Vec<_>>()).collect()
         }
@@ -235,8 +236,8 @@ fn referenced_files(path: &Path) -> Vec<PathBuf> {
         }
         _ => Vec::new(),
     };
-    let folder = path.parent().unwrap_or(Path::new(""));
-    names.iter().take(MAX_HASHED_FILES).map(|name| folder.join(name)).filter(|path| path.is_file()).collect()
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    names.iter().take(MAX_HASHED_FILES).filter_map(|name| load::find_referenced_file(folder, name)).collect()
 }
 
 fn words_of(text: &str) -> Vec<String> {
@@ -369,6 +370,12 @@ mod tests {
             write(path("a.bin"), content);
             keys.push(key("a.gltf", &options("x<0")));
             keys.push(key("", &options("x<0")));
+        }
+        // The loader reads a file in the folder for a path on another machine.
+        write(path("d.obj"), b"mtllib C:\\work\\D.MTL\n");
+        for content in [b"1", b"2"] {
+            write(path("d.mtl"), content);
+            keys.push(key("d.obj", &options("x<0")));
         }
         let different: std::collections::BTreeSet<&String> = keys.iter().collect();
         assert_eq!(different.len(), keys.len(), "{keys:?}");

@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use serde_json::json;
 use sha2::{Digest as _, Sha256};
 
-use super::{FileHashes, OpenedScene, SceneRepository, open, open_strict};
+use super::{FileHashes, LoadOptions, OpenedScene, SceneRepository, open, open_with};
 use crate::memory::MemoryReservation;
 
 const INSIDE: [u8; 4] = [10, 20, 30, 255];
@@ -75,7 +75,8 @@ fn open_upload(outer: &Path, name: &str) -> OpenedScene {
         Some((path.to_owned(), Sha256::digest(content).into()))
     };
     let hashes = Arc::new(files.filter_map(hash).collect::<FileHashes>());
-    SceneRepository::open_upload(&folder, name, &hashes, &MemoryReservation::unlimited()).expect(name)
+    let repository = SceneRepository::new(None).expect("a repository without a folder");
+    repository.open_upload(&folder, name, &hashes, &MemoryReservation::unlimited()).expect(name)
 }
 
 #[test]
@@ -114,10 +115,11 @@ fn paths_of_images_have_one_outcome_everywhere() {
             let served = repository.open(&format!("scene/{name}"), &MemoryReservation::unlimited());
             assert_eq!(outcome(&served.expect(reference)), found, "served {name}: {reference}");
             assert_eq!(outcome(&open_upload(outer.path(), name)), found, "uploaded {name}: {reference}");
+            let strict = open_with(&path, &LoadOptions { is_strict: true, ..LoadOptions::default() });
             match reason {
-                None => drop(open_strict(&path).expect(reference)),
+                None => drop(strict.expect(reference)),
                 Some(_) => {
-                    let message = open_strict(&path).expect_err(reference).to_string();
+                    let message = strict.expect_err(reference).to_string();
                     assert!(message.ends_with("(strict mode)"), "{message}");
                 }
             }

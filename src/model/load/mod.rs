@@ -61,10 +61,10 @@ pub use modes::{NpyArray, parse_numpy};
 pub use repository::SceneRepository;
 pub use source::is_built_in;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use asset_dir::AssetDir;
+use asset_dir::{AssetDir, ReferencedFile};
 
 use crate::backend_settings::BackendSettings;
 use crate::error::Result;
@@ -73,7 +73,7 @@ use crate::scene::{LengthUnit, LookPreset, PresetRequest, RenderSettings, Scene,
 /// How the files of a scene are read.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct LoadOptions {
-    /// Whether missing files and definitions, images of other formats, and values that would be corrected or ignored are
+    /// Whether missing files and definitions, images of other formats, and values out of range, not finite or not understood are
     /// errors instead of remarks.
     pub is_strict: bool,
     /// Replaces the unit of the file format or of `scene.toml`.
@@ -189,6 +189,15 @@ pub fn open_without_modes(source: &str, options: &LoadOptions) -> Result<Arc<Sce
     let mut parts = source::read_model(&options.apply_to_folder(&working_folder()), source, model_options)?;
     options.apply_to_model(&mut parts);
     Scene::new(parts)
+}
+
+/// The file that the loaders read for a reference of a model file in `folder` to an image or a material library
+/// ([`asset_dir::AssetDir::find_referenced`]); `None` if there is none.
+pub fn find_referenced_file(folder: &Path, reference: &str) -> Option<PathBuf> {
+    match AssetDir::unrestricted(folder).locate(reference) {
+        ReferencedFile::Exact(path) | ReferencedFile::Similar { path, .. } => Some(folder.join(path)),
+        ReferencedFile::Missing { .. } => None,
+    }
 }
 
 /// The files with the modes of a scene, each with its number of columns: `FILE (r = 20)`, without repetitions, in the
