@@ -40,8 +40,8 @@
 // 2^-18: the area sum of a group has a defined direction if it is longer than this fraction of B (`rounding_scale`
 // below), which is proportional to the bound of its rounding error. The twin has the derivation.
 constexpr double RESOLUTION = 1.0 / 262144.0;
-// 2^-20: a unit normal is lost if the cofactors of A map it to a vector of at most this fraction of their norm, as in the
-// twin, which also says how exact normals are then defined.
+// 2^-20: a unit normal is lost if the cofactors of A map it to a vector of at most this fraction of their norm, as in
+// the twin, which also says how exact normals are then defined.
 constexpr double FLATTENED = 1.0 / 1048576.0;
 // Two unit vectors are opposite if the length of their sum is below 1e-5 (1e-10 is its square), as in the twin.
 constexpr float MIN_BISECTOR_SQUARED_LENGTH = 1e-10f;

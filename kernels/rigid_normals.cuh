@@ -183,8 +183,8 @@ __device__ __forceinline__ void write_rigid_directions(const DeformArgs& args, O
     }
 #endif
 #ifdef SHEAR
-    write_rigid_normals(args, staging, slice, rest_normals,
-                        to_scaled_mat3f(inverse_transpose(load_linear_part(transforms_of(args), slice.domain))), first_corner);
+    const Mat3d normal_transform = inverse_transpose(load_linear_part(transforms_of(args), slice.domain));
+    write_rigid_normals(args, staging, slice, rest_normals, to_scaled_mat3f(normal_transform), first_corner);
 #else
     write_rigid_normals(args, staging, slice, rest_normals, load_scaled_linear_part(transforms_of(args), slice.domain),
                         first_corner);

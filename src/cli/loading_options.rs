@@ -15,13 +15,12 @@ pub(crate) struct LoadingOptions {
     /// format].
     #[arg(long, value_name = "AXIS")]
     pub(crate) up: Option<UpAxis>,
-    /// Treat missing material libraries, materials and images, images of unsupported formats, and values that would be
-    /// corrected or ignored, as errors instead of remarks.
+    /// Treat missing material libraries, materials and images, images of unsupported formats, and values out of range,
+    /// not finite or not understood, as errors instead of remarks.
     #[arg(long)]
     pub(crate) strict: bool,
 }
 
-#[allow(dead_code, reason = "modalcast-modes only parses the options")]
 impl LoadingOptions {
     /// The options of the loaders.
     pub(crate) fn load_options(&self) -> LoadOptions {
@@ -29,6 +28,7 @@ impl LoadingOptions {
     }
 
     /// The flags of the options that are given.
+    #[allow(dead_code, reason = "modalcast-modes starts no program")]
     pub(crate) fn arguments(&self) -> Vec<String> {
         let unit = self.unit.map(|unit| format!("--unit={unit}"));
         let up = self.up.map(|up| format!("--up={}", up.name()));

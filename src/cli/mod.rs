@@ -155,7 +155,12 @@ pub fn finish(outcome: Outcome) -> u8 {
         Ok(Completion::CheckFailed) => 1,
         Ok(Completion::ProgramFailed(code)) => code,
         Err(error) => {
-            eprintln!("modalcast: {error}");
+            // Errors contain texts of files, which must not control the terminal.
+            let message = error.to_string();
+            eprintln!(
+                "modalcast: {}",
+                message.replace(|character: char| character.is_control() && character != '\n', " ")
+            );
             exit_code(&error)
         }
     }

@@ -41,7 +41,7 @@ pub(super) struct Args {
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
     /// For all scenes, also uploads: treat missing material libraries, materials and images, images of unsupported formats,
-    /// and values that would be corrected or ignored, as errors instead of remarks.
+    /// and values out of range, not finite or not understood, as errors instead of remarks.
     #[arg(long)]
     strict: bool,
     /// Folder for uploads, the list of open scenes and their last steps. Default: the user's XDG state folder.

@@ -80,7 +80,7 @@ impl Args {
         }
     }
 
-    /// The options with which the server opens the shown scene.
+    /// The options with which the server opens its scenes.
     fn load_options(&self) -> LoadOptions {
         let options = self.loading.load_options();
         match self.modeling.is_requested() {

@@ -48,7 +48,7 @@ impl FromStr for LengthUnit {
     type Err = Error;
 
     fn from_str(text: &str) -> Result<Self> {
-        let named = NAMED_UNITS.into_iter().find(|(name, _)| *name == text).map(|(_, meters)| meters);
+        let named = NAMED_UNITS.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(text)).map(|(_, meters)| meters);
         match named.or_else(|| text.parse().ok()) {
             Some(meters) => Self::from_meters(meters),
             None => Err(not_a_unit(text)),
