@@ -158,6 +158,119 @@ def test_step_of_one_domain_has_nothing_of_the_others():
     assert (list(step.transform_domains), step.transforms) == ([9], moved.tobytes())
 
 
+# f32 rounds it by 0.2.
+FAR = 4_649_776.2
+
+
+def translated(y: float) -> Any:
+    placement = FRAME.astype(np.float64)
+    placement[1, 3] = y
+    return placement
+
+
+def far(y: float = FAR) -> dict[str, Any]:
+    """The placement of a domain, as descriptions have it."""
+    return {"placement": translated(y).astype(np.float32), "exact_placement": translated(y)}
+
+
+def listed(message: StepMessage) -> dict[int, float]:
+    """The translations along y in a message that lists domains."""
+    step = decode(message)
+    transforms = np.frombuffer(step.transforms, "<f4").reshape(-1, 3, 4)
+    return dict(zip(step.transform_domains, transforms[:, 1, 3].tolist(), strict=True))
+
+
+def test_rest_values_have_exact_placements():
+    _, transforms = rest_values(layout_of(domain(0), domain(1, **far())))
+    assert transforms.dtype == np.float64
+    np.testing.assert_array_equal(transforms, [FRAME, translated(FAR)])
+
+
+def test_complete_step_sends_far_domains_once_moved():
+    layout = layout_of(domain(0), domain(1, **far()), domain(2, **far(FAR + 1)))
+    values = StepValues(layout, None, *rest_values(layout))
+    receiver = Receiver(layout)
+    assert listed(values.complete_step(0, 0.0)) == {0: 0}
+    # The server has this transform already, in f64.
+    assert listed(values.step(1, 0.0, None, {1: translated(FAR)})) == {}
+    receiver.receive(values.complete_step(2, 0.0))
+    np.testing.assert_array_equal(receiver.transforms, rest_values(layout)[1])
+    assert listed(values.step(3, 0.0, None, {1: translated(FAR + 2)})) == {1: np.float32(FAR + 2)}
+    assert listed(values.complete_step(4, 0.0)) == {0: 0, 1: np.float32(FAR + 2)}
+    values.step(5, 0.0, None, {2: translated(FAR + 3)})
+    step = decode(values.complete_step(6, 0.0))
+    assert (list(step.transform_domains), len(step.transforms)) == ([], 3 * 48)
+    # Control: f32 represents all first transforms.
+    rounded = StepValues(layout, None, receiver.q, receiver.transforms.astype(np.float32))
+    step = decode(rounded.complete_step(0, 0.0))
+    assert (list(step.transform_domains), len(step.transforms)) == ([], 3 * 48)
+
+
+def test_array_of_scene_leaves_far_domains_that_it_only_rounds():
+    layout = layout_of(domain(0), domain(1), domain(2, **far()))
+    values = StepValues(layout, None, *rest_values(layout))
+    matrices = np.stack([translated(1), translated(2), translated(FAR)])
+    assert listed(values.step(0, 0.0, None, matrices)) == {0: 1, 1: 2}
+    matrices[2] = translated(5)
+    matrices[:2] += 1
+    assert not decode(values.step(1, 0.0, None, matrices)).transform_domains
+
+
+def test_reset_sends_far_domains_that_have_moved():
+    layout = layout_of(domain(0), *(domain(index, **far(FAR + index)) for index in range(1, 4)))
+    values = StepValues(layout, None, *rest_values(layout))
+    assert listed(values.at_rest().complete_step(0, 0.0)) == {0: 0}
+    values.step(1, 0.0, None, {2: translated(7)})
+    values = values.at_rest()
+    rest = {0: 0, 2: np.float32(FAR + 2)}
+    assert listed(values.complete_step(2, 0.0)) == rest
+    assert listed(values.at_rest().complete_step(3, 0.0)) == rest
+    # Domains with world poses return to rest too.
+    values = StepValues(layout, None, *rest_values(layout))
+    values.step(4, 0.0, None, {3: mc.WorldPose((0, 0, 0, 1), (0, 1e7, 0))})
+    assert listed(values.at_rest().complete_step(5, 0.0)) == {0: 0, 3: np.float32(FAR + 3)}
+
+
+def test_reset_sends_far_domains_that_an_earlier_drive_moved():
+    # f32 rounds a placement halfway between two f32 in either direction.
+    layout = layout_of(domain(0), *(domain(index, **far(4_649_776.25)) for index in range(1, 4)))
+    q, transforms = rest_values(layout)
+    transforms[1, 1, 3] += 1e-8
+    transforms[2, 1, 3] += 0.7
+    transforms[3, :, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    values = StepValues(layout, None, q, transforms)
+    assert listed(values.complete_step(0, 0.0)) == {0: 0}
+    expected = float(np.float32(4_649_776.25))
+    assert listed(values.at_rest().complete_step(1, 0.0)) == {0: 0, 2: expected, 3: expected}
+
+
+def test_joints_start_at_exact_placements():
+    """Control: transforms that f32 rounds move the attached domain with them."""
+
+    def child() -> Domain:
+        frame = FRAME + np.array([[0] * 4, [0, 0, 0, 0.1], [0] * 4], np.float32)
+        return domain(1, 0, parent=0, attachment_frame=frame, **far(FAR + 0.1))
+
+    layout = layout_of(domain(0, 0, **far()), child(), domain(2))
+    kinematics = Kinematics(layout, {})
+    q, transforms = rest_values(layout)
+    # 0.3 is above 0.25, where f32 rounds up.
+    assert (np.float32(FAR), np.float32(FAR + 0.1)) == (4_649_776.0, 4_649_776.5)
+    values = StepValues(layout, kinematics, q, transforms)
+    assert listed(values.step(0, 0.0, {2: [1, 2]}, None)) == {}
+    # The parent remains where it is, and so does its child.
+    assert listed(values.step(1, 0.0, None, {0: translated(FAR)})) == {}
+    assert listed(values.complete_step(2, 0.0)) == {2: 0}
+    rounded = StepValues(layout, kinematics, q, transforms.astype(np.float32))
+    assert listed(rounded.step(0, 0.0, {2: [1, 2]}, None)) == {1: 4_649_776.0}
+    # The joint moves the child.
+    assert listed(values.step(3, 0.0, None, {0: translated(8)})) == {0: 8, 1: np.float32(8.1)}
+    # After a reset, the parent is at its placement in f32, and the joint follows it.
+    values = values.at_rest()
+    assert not decode(values.complete_step(4, 0.0)).transform_domains
+    assert listed(values.step(5, 0.0, {2: [1, 2]}, None)) == {1: 4_649_776.0}
+
+
 @pytest.mark.parametrize("rank", [4, 200_000])
 def test_large_steps_are_sent_in_parts(rank: int):
     layout = layout_of(domain(0, rank), domain(1, rank))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from modalcast._step_message import StepMessage
 from modalcast._types import F32, F64, Indices, Rows, affine, to_f32, to_f64
@@ -82,20 +82,23 @@ class StepValues:
     the domains that it changes, not on those of the scene. Arrays of all domains are converted without a loop.
     """
 
-    def __init__(self, layout: StateLayout, kinematics: Kinematics | None, q: F32, transforms: F32) -> None:
+    def __init__(self, layout: StateLayout, kinematics: Kinematics | None, q: F32, transforms: F64 | F32) -> None:
         """Begins with a state.
 
         Args:
             layout: The layout of the scene.
             kinematics: Computes the transforms of attached domains; None leaves them to the caller.
             q: All coordinates.
-            transforms: world_from_domain of every domain, domains x 3 x 4.
+            transforms: world_from_domain of every domain as the server has it, domains x 3 x 4.
         """
         self._layout = layout
         self._kinematics = kinematics
         self._q = q.copy()
-        # The transforms that the server has.
-        self._sent: F32 = transforms.copy()
+        self._first: F64 = transforms.astype(np.float64)
+        # The first transforms rounded to f32, or those that steps have sent since.
+        self._sent: F32 = transforms.astype(np.float32)
+        # Whether the server has exactly the transform in `_sent`: f32 represents the first one, or a step has sent it.
+        self._is_exact = (self._sent == self._first).all(axis=(1, 2))
         # The last pose of each domain, if the caller sends poses instead of matrices.
         self._poses: Rows = np.zeros(len(transforms), _POSE)
         self._has_pose = np.zeros(len(transforms), bool)
@@ -103,7 +106,7 @@ class StepValues:
         self._is_attached = layout.is_attached & (kinematics is not None)
         self._own = layout.roots[~self._is_attached[layout.roots]]
         # world_from_domain in f64, 4 x 4, from which the transforms of attached domains are computed.
-        self._world: F64 = square(transforms) if kinematics is not None else np.empty((0, 4, 4))
+        self._world: F64 = square(self._first) if kinematics is not None else np.empty((0, 4, 4))
         # Whether the transforms of attached domains may not follow from the coordinates, as those of the first state.
         self._is_world_stale = True
 
@@ -136,7 +139,8 @@ class StepValues:
         """A step with all values, for a server that may have lost some of them.
 
         Transforms of a step have one format. If earlier steps have sent world poses, this step has the last pose of
-        each domain, and domains without a pose keep the transforms that the server has.
+        each domain, and domains without a pose keep the transforms that the server has. Otherwise it has matrices. A
+        domain whose first transform f32 would round keeps the one that the server has until a step sends another one.
         """
         message = StepMessage(steps_pb2.Step(number=number, time=time))
         self._add_q(message, self._q)
@@ -144,8 +148,19 @@ class StepValues:
             domains = np.flatnonzero(self._has_pose)
             self._add_poses(message, _GivenTransforms(domains, self._poses[domains]))
         else:
-            message.transforms = self._sent.take(self._layout.roots, axis=0)
+            roots = self._layout.roots
+            self._add_sent(message, roots[self._is_exact[roots]])
         return message
+
+    def at_rest(self) -> StepValues:
+        """The values at rest. Their complete step returns the scene to rest from the values of this object.
+
+        Domains that have moved return to their placement in f32, and those that have not moved keep it in f64.
+        """
+        q, transforms = rest_values(self._layout)
+        has_moved = self._is_exact | self._has_pose | _differ(self._first, transforms)
+        transforms[has_moved] = transforms[has_moved].astype(np.float32)
+        return StepValues(self._layout, self._kinematics, q, transforms)
 
     def _add_q(self, message: StepMessage, new_q: dict[int, F32] | F32) -> None:
         if not isinstance(new_q, dict):
@@ -167,14 +182,24 @@ class StepValues:
             message.head.transform_domains.extend(given.domains.tolist())
 
     def _add_matrices(self, message: StepMessage, given: _GivenTransforms, new_q: dict[int, F32] | F32) -> None:
-        moved = np.concatenate((self._store(given.domains, given.rows), self._move_attached(given, new_q)))
+        moved = self._store(given.domains, given.rows)
+        if self._kinematics is not None:
+            # The server keeps a transform in f64 if the given one is its rounding to f32.
+            self._world[moved, :3] = self._sent[moved]
+        moved = np.concatenate((moved, self._move_attached(given, new_q)))
         roots = self._layout.roots
-        if given.is_whole and 2 * len(moved) > len(roots):
+        if given.is_whole and 2 * len(moved) > len(roots) and self._is_exact[roots].all():
             # A list of domains takes longer than the transforms that have not changed.
-            message.transforms = self._sent.take(roots, axis=0)
-        elif len(moved) > 0:
-            message.head.transform_domains.extend(moved.tolist())
-            message.transforms = self._sent.take(moved, axis=0)
+            moved = roots
+        self._add_sent(message, moved)
+
+    def _add_sent(self, message: StepMessage, domains: Indices) -> None:
+        """Adds the stored transforms of domains, without a list if these are all roots in order."""
+        if len(domains) == 0:
+            return
+        message.transforms = self._sent.take(domains, axis=0)
+        if not np.array_equal(domains, self._layout.roots):
+            message.head.transform_domains.extend(domains.tolist())
 
     def _store(self, domains: Indices, matrices: F32) -> Indices:
         """Stores transforms. Returns the domains whose transform has changed in any bit."""
@@ -182,14 +207,15 @@ class StepValues:
             return domains
         stored = self._sent.take(domains, axis=0)
         self._sent[domains] = matrices
-        return domains[(matrices.view(np.uint32) != stored.view(np.uint32)).any(axis=(1, 2))]
+        changed = domains[(matrices.view(np.uint32) != stored.view(np.uint32)).any(axis=(1, 2))]
+        self._is_exact[changed] = True
+        return changed
 
     def _move_attached(self, given: _GivenTransforms, new_q: dict[int, F32] | F32) -> Indices:
         """Computes the transforms that depend on new values. Returns the domains whose transform has changed."""
         none = _NO_TRANSFORMS.domains
         if self._kinematics is None or (isinstance(new_q, dict) and len(new_q) + len(given.domains) == 0):
             return none
-        self._world[given.domains, :3] = given.rows
         changed: list[int] | None = None
         new_values: list[F32 | F64] = [self._q, self._world]
         if not self._is_world_stale:
@@ -258,12 +284,26 @@ class StepValues:
         return _GivenTransforms(np.array(list(rows), np.intp), np.stack(list(rows.values())))
 
 
-def rest_values(layout: StateLayout) -> tuple[F32, F32]:
-    """The coordinates and the transforms of the scene at rest."""
+def rest_values(layout: StateLayout) -> tuple[F32, F64]:
+    """The coordinates of the scene at rest, and world_from_domain of every domain at rest, domains x 3 x 4."""
     q = np.zeros(layout.coordinate_count, np.float32)
     for index in layout.owners:
         q[layout.q_slice(layout.domains[index])] = layout.domains[index].rest_q
-    return q, np.stack([domain.placement for domain in layout.domains]).astype(np.float32)
+    placements = [
+        domain.placement if domain.exact_placement is None else domain.exact_placement for domain in layout.domains
+    ]
+    return q, np.stack(placements).astype(np.float64)
+
+
+def _differ(transforms: F64, others: F64) -> NDArray[np.bool_]:
+    """Whether each transform, n x 3 x 4, differs from the other one by more than the rounding of f32."""
+    differences, magnitudes = np.abs(transforms - others), np.abs(others)
+    # f32 rounds a number by at most 2^-24 of its magnitude.
+    exceeds = [
+        differences[:, :, part].max(axis=(1, 2)) > 2.0**-24 * magnitudes[:, :, part].max(axis=(1, 2))
+        for part in (slice(0, 3), slice(3, 4))
+    ]
+    return exceeds[0] | exceeds[1]
 
 
 def to_time(time: float) -> float:

@@ -6,8 +6,6 @@ import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
 from modalcast._common import Delivery, StepId, delivery_message
@@ -36,6 +34,7 @@ class Drive:
 
     After a lost connection, a drive opens a new stream with its lease token, for as long as the client's `reconnect`
     allows, and sends all coordinates and transforms. Steps without acknowledgment may be lost, but not their values.
+    Domains so far from the scene's origin that f32 rounds their transforms are sent only if a step has moved them.
 
     Attributes:
         run: The number of this writer. Later writers of the scene have larger numbers.
@@ -139,12 +138,14 @@ class Drive:
     async def reset(self, *, timeout: float | None = None) -> StepId:
         """Sends a step with the coordinates and the transforms at rest.
 
+        Domains that have moved return to their placement in f32, which rounds it far from the scene's origin.
+
         Raises:
             Error: As for `step`.
         """
         timeout = self._timeout if timeout is None else timeout
         self._check_open()
-        self._values = StepValues(self._layout, self._kinematics, *rest_values(self._layout))
+        self._values = self._values.at_rest()
         self._time += self._options.dt
         try:
             await self._send(self._values.complete_step(self._next_number, self._time), timeout)
@@ -289,8 +290,7 @@ class Drive:
     async def _load_state(self) -> None:
         """Takes the first values from the current state of the server."""
         state = await self._read_state()
-        transforms = state.scene_transforms.astype(np.float32)
-        self._values = StepValues(self._layout, self._kinematics, state.q, transforms)
+        self._values = StepValues(self._layout, self._kinematics, state.q, state.scene_transforms)
 
     async def _resume(self) -> None:
         """Opens a new stream after a lost connection, and sends all values."""
