@@ -60,7 +60,10 @@ impl TransformRoots {
                 continue;
             };
             let [root, parent_frame_index] = table.root_and_frame_indices[constraint.parent];
-            let parent_from_domain = constraint.frame.to_matrix();
+            let (parent, domain) = (&domains[constraint.parent], &domains[index]);
+            let is_centered = [parent, domain].iter().any(|domain| shapes[domain.shape].is_centered());
+            let exact_frame = is_centered.then(|| exact_frame(parent, domain, constraint.frame)).flatten();
+            let parent_from_domain = exact_frame.unwrap_or_else(|| constraint.frame.to_matrix());
             // A parent that is a root has no frame: `NO_FRAME` is beyond the end of `frames_f64`.
             let frame = frames_f64
                 .get(parent_frame_index as usize)
@@ -147,6 +150,16 @@ impl TransformRoots {
 /// The list, or an empty list if all points are zero.
 fn non_zero(points: Vec<[f64; 3]>) -> Vec<[f64; 3]> {
     if points.iter().all(|point| *point == [0.0; 3]) { Vec::new() } else { points }
+}
+
+/// The frame of a follower in f64 from the placements of both domains, which are exact; `None` if they do not have the
+/// frame `rounded`. In coordinates of a map, f32 rounds the translation of the frame too coarsely.
+fn exact_frame(parent: &Domain, domain: &Domain, rounded: Transform) -> Option<Matrix4<f64>> {
+    let rounded = rounded.to_matrix();
+    let exact = parent.placement_matrix().try_inverse()? * domain.placement_matrix();
+    let is_rounding =
+        |(exact, rounded): (&f64, &f64)| (exact - rounded).abs() <= f64::from(f32::EPSILON) * rounded.abs() + 1e-12;
+    exact.iter().zip(rounded.iter()).all(is_rounding).then_some(exact)
 }
 
 /// The frame of a follower for rest positions relative to `origin`, and for a root with a pivot.

@@ -286,10 +286,11 @@ impl ManifestAssembler<'_> {
         let parent_domain = &self.parts.domains[parent];
         let parent_from_world = parent_domain.placement_matrix().try_inverse();
         let singular_placement = || invalid("parent", "a parent whose placement has an inverse", &parent_domain.name);
-        let frame = Transform::from_matrix(&(parent_from_world.ok_or_else(singular_placement)? * world_from_child));
+        let exact_frame = parent_from_world.ok_or_else(singular_placement)? * world_from_child;
+        let frame = Transform::from_matrix(&exact_frame);
         let vertices = match &entry.parent_vertices {
             Some(vertices) => vertices.clone(),
-            None => nearest_vertices(&self.parts.shapes[parent_domain.shape], frame),
+            None => nearest_vertices(&self.parts.shapes[parent_domain.shape], &exact_frame),
         };
         Ok(Attachment { parent, frame, vertices })
     }
@@ -416,11 +417,11 @@ fn up_axis_rotation(model_up: Option<UpAxis>, scene_up: UpAxis) -> Transform {
 
 /// The [`DEFAULT_ATTACHMENT_VERTICES`] vertices of a deformable shape nearest to the translation of `frame`, in
 /// ascending order of their indices. Empty for a rigid shape.
-fn nearest_vertices(shape: &Shape, frame: Transform) -> Vec<u32> {
+fn nearest_vertices(shape: &Shape, frame: &Matrix4<f64>) -> Vec<u32> {
     if shape.modes.rank() == 0 {
         return Vec::new();
     }
-    let origin = frame.translation();
+    let origin = frame.fixed_view::<3, 1>(0, 3).into_owned();
     let squared_distances: Vec<f64> =
         shape.exact_positions().map(|position| (nalgebra::Vector3::from(position) - origin).norm_squared()).collect();
     let mut vertices: Vec<u32> = (0..squared_distances.len() as u32).collect();

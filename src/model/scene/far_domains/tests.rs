@@ -274,6 +274,28 @@ fn far_shape_with_an_opposite_placement_is_exact() {
     assert!(scene.rest_bounds.max.iter().all(|coordinate| coordinate.abs() < 1.0));
 }
 
+/// A follower near the origin of its own file, at a far place of its parent: f32 would round its frame by 0.25.
+#[test]
+fn frames_of_followers_on_far_parents_are_exact() {
+    let place = Matrix4::new_translation(&Vector3::new(500_000.9, 4_649_776.7, -29.7));
+    let bodies = [tetrahedron([500_000.3, 4_649_776.2, -30.0]), tetrahedron([0.0; 3])];
+    let mut parts = parts_of(&bodies);
+    parts.domains[1].set_placement(&place);
+    parts.domains[1].follows = Some(FollowConstraint { parent: 0, frame: Transform::from_matrix(&place) });
+    let scene = Scene::new(parts).expect("a scene");
+    let mut state = SceneState::rest(&scene);
+    let error = |state: &SceneState, transform: &Matrix4<f64>| {
+        let expected = expected_positions(&scene, 1, &bodies[1], 0.0, transform);
+        relative_error(&computed_positions(&scene, state, 1), &expected)
+    };
+    assert!(error(&state, &place) <= MAX_ERROR);
+    let rounded = Transform::from_matrix(&place).to_matrix();
+    assert!(error(&state, &rounded) > 0.1, "control: f32 moves the follower");
+    let (raw, t) = pose_step(0, UnitQuaternion::from_euler_angles(0.3, 0.5, -0.8), [10.0, -20.0, 5.0]);
+    state.apply(&scene, &StepUpdate::parse(&scene, &raw).expect("a valid step"));
+    assert!(error(&state, &(t * place)) <= 4.0 * MAX_ERROR);
+}
+
 /// A near body and a far one, and a follower of the far one.
 #[test]
 fn followers_and_distant_neighbors_are_exact() {
