@@ -7,7 +7,7 @@ use super::npz::lacks_modes;
 use crate::error::Result;
 use crate::load::asset_dir::{AssetDir, EntryKind, stem_of};
 use crate::load::folder_listing::{FolderListing, ModesNames};
-use crate::load::source::{find_model, find_models, recognize_model};
+use crate::load::source::{find_model, find_models};
 
 /// The rule in words, for remarks.
 const NAMES: &str = "the modes of MODEL are in MODEL.U.npy, MODEL.npy, MODEL.U.float or another name of the reference \
@@ -92,7 +92,7 @@ fn collect_names(files: &AssetDir, listing: &FolderListing) -> ModesNames {
     let mut names = ModesNames { models, ..ModesNames::default() };
     let mut models_by_stem: HashMap<&str, Vec<&str>> = HashMap::new();
     for name in listing.file_names() {
-        if recognize_model(name).is_some() {
+        if find_model(files, name).is_some() {
             models_by_stem.entry(model_stem(name)).or_default().push(name);
         }
     }
