@@ -26,7 +26,7 @@
 //! - An image or material library that does not exist or is outside of the folder of the scene, and an image that is no
 //!   PNG, JPEG or WebP image, are replaced by a default with a remark. In strict mode, they are errors. The folder of the
 //!   scene is that of `scene.toml` or, without one or for a model elsewhere, that of the model
-//!   ([`asset_dir::AssetDir::find_referenced`]).
+//!   (`find_referenced` of the module `asset_dir`).
 
 mod asset_dir;
 mod conversion;
@@ -192,7 +192,7 @@ pub fn open_without_modes(source: &str, options: &LoadOptions) -> Result<Arc<Sce
 }
 
 /// The file that the loaders read for a reference of a model file in `folder` to an image or a material library
-/// ([`asset_dir::AssetDir::find_referenced`]); `None` if there is none.
+/// (`find_referenced` of the module `asset_dir`); `None` if there is none.
 pub fn find_referenced_file(folder: &Path, reference: &str) -> Option<PathBuf> {
     match AssetDir::unrestricted(folder).locate(reference) {
         ReferencedFile::Exact(path) | ReferencedFile::Similar { path, .. } => Some(folder.join(path)),
