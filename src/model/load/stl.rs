@@ -247,6 +247,12 @@ mod tests {
         assert_eq!(words(b"", [0x8000 | (16 << 5), 31]), [Some([0, 132, 0]), None]);
         assert_eq!(words(magics, [31, 0x8000]), [red, Some([10, 20, 30])]);
         assert_eq!(words(magics, [0, 0]), [Some([10, 20, 30]); 2]);
+        assert_eq!(words(magics, [0x8000; 2]), [Some([10, 20, 30]); 2]);
+        // MeshLab.
+        let meshlab = b"VCG COLOR=\x7f\x7f\x7f\x7f";
+        assert_eq!(words(magics, [0x8000 | 31, 0x8000 | (31 << 10)]), [red, blue]);
+        assert_eq!(words(meshlab, [0x8000 | 31; 2]), [red; 2]);
+        assert!(words(meshlab, [0, 0]).is_empty());
         assert!(words(b"", [0, 0]).is_empty());
         assert!(words(b"", [1, 0x7fff]).is_empty());
     }
