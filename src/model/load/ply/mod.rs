@@ -41,6 +41,10 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
 fn add_materials(polygons: &mut PolygonMesh, files: &AssetDir, parts: &mut SceneParts) -> Result<()> {
     let has_images = polygons.has_uvs() && polygons.materials.iter().any(|name| !name.is_empty());
     if !polygons.face_colors.is_empty() {
+        // Programs without colors of vertices write white ones.
+        if polygons.colors.iter().all(|color| *color == [1.0; 3]) {
+            polygons.colors.clear();
+        }
         let reason = if has_images { Some("the faces have images") } else { None };
         let reason = reason.or((!polygons.colors.is_empty()).then_some("the vertices have colors"));
         let Some(reason) = reason else {

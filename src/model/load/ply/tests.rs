@@ -185,16 +185,24 @@ fn colors_of_faces_are_materials_unless_vertices_have_colors() {
         std::fs::write(folder.path().join("a.ply"), text).expect("a writable file");
         read(&AssetDir::unrestricted(folder.path()), "a.ply", ModelOptions::default()).expect("a valid file")
     };
-    for (channel, colors) in [("uchar", ["9 9 9", "255 0 0", "0 0 255"]), ("float", ["0.5 0 0", "1 0 0", "0 0 1"])] {
+    for (channel, colors) in [
+        ("uchar", ["9 9 9", "255 0 0", "0 0 255"]),
+        ("float", ["0.5 0 0", "1 0 0", "0 0 1"]),
+        ("float", ["128 64 32", "255 0 0", "0 0 255"]),
+    ] {
         let parts = read_with("", channel, colors, "");
         let diffuse: Vec<_> = parts.materials.iter().map(|material| material.diffuse).collect();
         assert_eq!(diffuse, [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]);
         assert_eq!(parts.domains[0].material_ranges.len(), 2);
         assert!(!parts.remarks.iter().any(|remark| remark.contains("face.red")), "{:?}", parts.remarks);
+        let is_divided = parts.remarks.iter().any(|remark| remark.starts_with("colors of faces are divided by 255"));
+        assert_eq!(is_divided, channel == "float" && colors[1] == "255 0 0", "{:?}", parts.remarks);
     }
     let properties = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
     let parts = read_with(properties, "uchar", ["9 9 9", "255 0 0", "0 0 255"], " 0 255 0");
     assert_eq!((parts.materials.len(), parts.materials[0].diffuse), (1, [0.0, 1.0, 0.0]));
+    let white = read_with(properties, "uchar", ["9 9 9", "255 0 0", "0 0 255"], " 255 255 255");
+    assert_eq!((white.materials.len(), white.materials[0].diffuse), (2, [1.0, 0.0, 0.0]));
     let remark = "colors of faces are not used, because the vertices have colors";
     assert!(parts.remarks.iter().any(|given| given == remark), "{:?}", parts.remarks);
 }
