@@ -71,9 +71,11 @@ mod tests {
 
     #[test]
     fn unknown_units_and_axes_are_rejected_with_the_known_ones() {
-        for (words, expected) in
-            [(["--unit", "yard"], "expected m, mm, cm"), (["--unit", "0"], "positive"), (["--up", "w"], "x, y or z")]
-        {
+        for (words, expected) in [
+            (["--unit", "yard"], "expected m, mm, cm"),
+            (["--unit", "0"], "1e-12 to 1e12"),
+            (["--up", "w"], "x, y or z"),
+        ] {
             let message = parse(&words).expect_err("an error").to_string();
             assert!(message.contains(expected), "{message}");
         }

@@ -1,6 +1,7 @@
 //! Units of length, and their text format.
 
 use std::fmt;
+use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use serde::de::{Deserialize, Deserializer, Visitor};
@@ -11,7 +12,10 @@ use crate::error::{Error, Result, invalid};
 const NAMED_UNITS: [(&str, f64); 6] =
     [("m", 1.0), ("mm", 1e-3), ("cm", 1e-2), ("um", 1e-6), ("in", 0.0254), ("ft", 0.3048)];
 
-/// A unit of length: a positive, finite number of meters. Its text, also in `scene.toml`, is `m`, `mm`, `cm`, `um`, `in`,
+/// The units that are accepted, in meters.
+const UNIT_RANGE: RangeInclusive<f64> = 1e-12..=1e12;
+
+/// A unit of length: a number of meters from 1e-12 to 1e12. Its text, also in `scene.toml`, is `m`, `mm`, `cm`, `um`, `in`,
 /// `ft`, or the number of meters.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LengthUnit {
@@ -24,9 +28,9 @@ impl LengthUnit {
     /// A unit of this many meters.
     ///
     /// # Errors
-    /// `Invalid` unless the number is positive and finite.
+    /// `Invalid` for a number outside of 1e-12 to 1e12.
     pub fn from_meters(meters: f64) -> Result<Self> {
-        match meters.is_finite() && meters > 0.0 {
+        match UNIT_RANGE.contains(&meters) {
             true => Ok(Self { meters }),
             false => Err(not_a_unit(meters)),
         }
@@ -40,7 +44,7 @@ impl LengthUnit {
 
 fn not_a_unit(given: impl fmt::Display) -> Error {
     let names = NAMED_UNITS.map(|(name, _)| name).join(", ");
-    invalid("unit", format!("{names}, or a positive number of meters"), given)
+    invalid("unit", format!("{names}, or a number of meters from 1e-12 to 1e12"), given)
 }
 
 /// Parses the name of a unit, or a number of meters.
@@ -117,10 +121,11 @@ mod tests {
 
     #[test]
     fn other_texts_are_rejected_with_the_known_names() {
-        for text in ["", "yard", "0", "-1", "nan", "inf", "1 mm"] {
+        for text in ["", "yard", "0", "-1", "nan", "inf", "1e300", "1 mm"] {
             let message = text.parse::<LengthUnit>().expect_err(text).to_string();
             assert!(
-                message.starts_with("unit: expected m, mm, cm, um, in, ft, or a positive number of meters, got"),
+                message
+                    .starts_with("unit: expected m, mm, cm, um, in, ft, or a number of meters from 1e-12 to 1e12, got"),
                 "{message}"
             );
         }
