@@ -191,7 +191,8 @@ impl AssetDir {
             };
             return Err(invalid(field_of(reference), expected, format!("{given} (strict mode)")));
         }
-        let treatment = path.as_ref().map_or_else(|| stand_in.to_owned(), |path| format!("'{path}' is read"));
+        let advice = if reason == OUTSIDE { "; copy the file there" } else { "" };
+        let treatment = path.as_ref().map_or_else(|| format!("{stand_in}{advice}"), |path| format!("'{path}' is read"));
         remarks.push(format!("{subject} {reason}: {treatment}"));
         Ok(path)
     }

@@ -1,8 +1,8 @@
 //! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
 //!
 //! Programs without ambient light write a gray as Ka, such as black, white or 0.2 of any Kd, so a gray also means Kd. A
-//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd. There is no highlight with
-//! `illum 0` and `illum 1`, or with an exponent Ns that is missing or below 1, with which the highlight would cover the
+//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd, unless Kd is black. There is no highlight with
+//! `illum 0` and `illum 1`, or with an exponent Ns that is missing or at most 1, with which the highlight would cover the
 //! whole lit side; files use 0 for "not specified".
 
 use super::mtl::MtlMaterial;
@@ -39,16 +39,18 @@ pub(super) fn create_material(
     let diffuse = color("Kd", statements.diffuse).unwrap_or([1.0; 3]);
     let is_gray = |color: &[f32; 3]| color[0] == color[1] && color[1] == color[2];
     let ambient = color("Ka", statements.ambient).filter(|color| !is_gray(color)).unwrap_or(diffuse);
-    let ambient = [0, 1, 2].map(|channel| ambient[channel].min(diffuse[channel]));
+    let is_lit_by_sky_only = diffuse == [0.0; 3];
+    let limit = |channel: usize| if is_lit_by_sky_only { 1.0 } else { diffuse[channel] };
+    let ambient = [0, 1, 2].map(|channel| ambient[channel].min(limit(channel)));
     let specular = color("Ks", statements.specular).filter(|_| !statements.is_matte).unwrap_or([0.0; 3]);
     let mut number = |statement: &str, value: Option<f32>, range: [f32; 2]| {
         corrections.in_range(&field_of(statement), value?, range, "the default is used")
     };
     let alpha = number("d", statements.opacity, [0.0, 1.0]).unwrap_or(1.0);
-    let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).filter(|exponent| *exponent >= 1.0);
+    let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).filter(|exponent| *exponent > 1.0);
     remarks.extend(corrections.remarks(files.is_strict())?);
     if specular != [0.0; 3] && exponent.is_none() {
-        remarks.push(field_of("Ks is not used, because Ns is missing or below 1"));
+        remarks.push(field_of("Ks is not used, because Ns is missing or at most 1"));
     }
     let statements = &with_paths_of_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
@@ -197,8 +199,10 @@ mod tests {
         let (default, ..) = read("newmtl m\nNs 0\n", folder.path()).expect("a valid material");
         assert_eq!((default.diffuse, default.ambient, default.specular), ([1.0; 3], [1.0; 3], [0.0; 3]));
         assert_eq!((default.shininess, default.alpha_mode), (1.0, AlphaMode::Opaque));
-        let (black, ..) = read("newmtl m\nKd 0 0 0\n", folder.path()).expect("a valid material");
-        assert_eq!((black.diffuse, black.ambient), ([0.0; 3], [0.0; 3]));
+        for (statement, ambient) in [("", [0.0; 3]), ("Ka 1 1 1\n", [0.0; 3]), ("Ka 0.5 0 0\n", [0.5, 0.0, 0.0])] {
+            let (black, ..) = read(&format!("newmtl m\nKd 0 0 0\n{statement}"), folder.path()).expect("a material");
+            assert_eq!((black.diffuse, black.ambient), ([0.0; 3], ambient), "{statement}");
+        }
     }
 
     /// A gray is what programs without ambient light write as Ka.
@@ -221,10 +225,11 @@ mod tests {
     #[test]
     fn highlights_need_an_illumination_model_and_an_exponent() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let remark = "material 'm': Ks is not used, because Ns is missing or below 1";
+        let remark = "material 'm': Ks is not used, because Ns is missing or at most 1";
         for (statements, specular, remarks) in [
             ("Ns 20", 0.5, vec![]),
-            ("Ns 1\nillum 2", 0.5, vec![]),
+            ("Ns 1.5\nillum 2", 0.5, vec![]),
+            ("Ns 1", 0.0, vec![remark]),
             ("Ns 20\nillum 1", 0.0, vec![]),
             ("Ns 20\nillum 0", 0.0, vec![]),
             ("Ns 0\nillum 1", 0.0, vec![]),

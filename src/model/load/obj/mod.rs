@@ -247,7 +247,9 @@ mod tests {
             ("../a.mtl", vec!["'../a.mtl' is outside of the folder of the scene: 'a.mtl' is read"]),
             (
                 "../no.mtl",
-                vec!["'../no.mtl' is outside of the folder of the scene: the default color is drawn for its materials"],
+                vec![
+                    "'../no.mtl' is outside of the folder of the scene: the default color is drawn for its materials; copy the file there",
+                ],
             ),
         ] {
             let text = format!("mtllib {statement}\n{TRIANGLE}f 1 2 3\n");
