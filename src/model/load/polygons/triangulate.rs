@@ -17,12 +17,19 @@ pub(super) struct Triangulation {
 ///
 /// If all triangles of the fan from the first corner have the polygon's orientation, the fan is used. Otherwise a
 /// quadrilateral is split along its other diagonal, and a larger polygon in the plane of its normal (Newell's method). The
-/// triangles of a polygon with a hole, whose outline runs to the hole and back, do not cover the hole.
+/// triangles of a polygon with a hole, whose outline runs to the hole and back, do not cover the hole. Consecutive corners
+/// at one place get triangles without area: their vertices are different and can move apart.
 pub(super) fn triangulate(points: &[[f32; 3]]) -> Triangulation {
     let fan: Vec<_> = (2..points.len()).map(|index| [0, index - 1, index]).collect();
     let exact = |triangles| Triangulation { triangles, is_inexact: false };
     if points.len() <= 3 {
         return exact(fan);
+    }
+    let count = points.len();
+    let is_repeated = |index: &usize| points[*index] == points[(*index + count - 1) % count];
+    let distinct: Vec<usize> = (0..count).filter(|index| !is_repeated(index)).collect();
+    if count > 4 && distinct.len() < count && distinct.len() > 2 {
+        return triangulate_with_repetitions(points, &distinct);
     }
     let points: Vec<_> = points.iter().map(|point| Vector3::from(*point).cast::<f64>()).collect();
     let normal = newell_normal(&points);
@@ -41,6 +48,21 @@ pub(super) fn triangulate(points: &[[f32; 3]]) -> Triangulation {
         Some(triangles) => exact(triangles),
         None => Triangulation { triangles: fan, is_inexact: true },
     }
+}
+
+/// Triangulates a polygon of which only the corners `distinct` have another place than the corner before them. A run of
+/// the others is filled by a fan from the corner before it.
+fn triangulate_with_repetitions(points: &[[f32; 3]], distinct: &[usize]) -> Triangulation {
+    let distinct_points: Vec<_> = distinct.iter().map(|index| points[*index]).collect();
+    let Triangulation { mut triangles, is_inexact } = triangulate(&distinct_points);
+    triangles.iter_mut().flatten().for_each(|index| *index = distinct[*index]);
+    for (place, corner) in distinct.iter().enumerate() {
+        let next = distinct[(place + 1) % distinct.len()];
+        let run = (next + points.len() - corner - 1) % points.len();
+        let repeated = |index: usize| (corner + index) % points.len();
+        triangles.extend((1..=run).map(|index| [*corner, repeated(index), repeated(index + 1)]));
+    }
+    Triangulation { triangles, is_inexact }
 }
 
 /// Twice the area vector; zero for a polygon without area.
@@ -164,6 +186,34 @@ mod tests {
             assert!(has_edge(corner, next), "expected a triangle at the edge from {corner} to {next}: {triangles:?}");
         }
         assert_eq!(signed_and_absolute_area(&polygon, &triangles), [15.0; 2]);
+    }
+
+    /// Different vertices at one place may move apart: each edge of the outline is an edge of a triangle.
+    #[test]
+    fn repeated_places_have_triangles_of_their_own() {
+        let arrow = [[2.0, 0.0], [0.5, 0.5], [0.0, 2.0], [0.0, 0.0]].map(|[x, y]| [x, y, 0.0]);
+        for runs in [[2, 1, 1, 1], [1, 3, 1, 1], [1, 1, 1, 2], [2, 1, 3, 2]] {
+            let repeat = |(point, run): (&[f32; 3], &usize)| vec![*point; *run];
+            let unrotated: Vec<[f32; 3]> = arrow.iter().zip(&runs).flat_map(repeat).collect();
+            for shift in 0..unrotated.len() {
+                let mut polygon = unrotated.clone();
+                polygon.rotate_left(shift);
+                let triangles = triangulate(&polygon).triangles;
+                assert_eq!(triangles.len(), polygon.len() - 2, "{runs:?} {shift}");
+                for corner in 0..polygon.len() {
+                    let edge = [corner, (corner + 1) % polygon.len()];
+                    let sides =
+                        |triangle: &[usize; 3]| [0, 1, 2].map(|side| [triangle[side], triangle[(side + 1) % 3]]);
+                    assert!(
+                        triangles.iter().any(|triangle| sides(triangle).contains(&edge)),
+                        "{edge:?}: {triangles:?}"
+                    );
+                }
+                for area in signed_and_absolute_area(&polygon, &triangles) {
+                    assert!((area - 1.0).abs() < 1e-9, "{runs:?} {shift}: got {area}");
+                }
+            }
+        }
     }
 
     /// Corners on straight edges are corners of triangles, because the polygon beside the edge has them too.
