@@ -66,6 +66,11 @@ impl MtlMaterial {
             b"ka" => self.ambient = Some(self.parse_color(line, material_name)?),
             b"kd" => self.diffuse = Some(self.parse_color(line, material_name)?),
             b"ks" => self.specular = Some(self.parse_color(line, material_name)?),
+            b"ke" => {
+                if self.parse_color(line, material_name)?.iter().any(|channel| *channel > 0.0) {
+                    self.remarks.push(format!("material '{material_name}': emission (Ke) is ignored"));
+                }
+            }
             b"ns" => self.exponent = Some(parse_last_number(line)?),
             b"illum" => self.is_matte = parse_last_number(line)? < 2.0,
             b"d" => self.opacity = Some(parse_last_number(line)?),
@@ -179,6 +184,14 @@ mod tests {
         let materials = parse(b"newmtl vtk\nTr 1\nnewmtl hidden\nd 0\n").expect("a valid file");
         assert_eq!((materials["vtk"].opacity, materials["hidden"].opacity), (None, Some(0.0)));
         assert_eq!(materials["vtk"].remarks, ["material 'vtk': Tr 1 hides the surface, and is read as opaque"]);
+    }
+
+    #[test]
+    fn emission_has_a_remark_unless_it_is_black() {
+        for (statement, remarks) in [("Ke 0 0.5 0", 1), ("Ke 0 0 0", 0), ("Ke 0.0", 0)] {
+            let materials = parse(format!("newmtl lamp\n{statement}\n").as_bytes()).expect("a text");
+            assert_eq!(materials["lamp"].remarks.len(), remarks, "{statement}");
+        }
     }
 
     #[test]
