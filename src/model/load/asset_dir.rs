@@ -186,12 +186,15 @@ impl AssetDir {
         };
         if self.is_strict {
             let (expected, given) = match reason {
-                OUTSIDE => ("a path in the folder of the scene", "a path outside of it"),
-                _ => ("an existing file", path.as_deref().unwrap_or("none")),
+                OUTSIDE => ("a path in the folder of the scene", "a path outside of it".to_owned()),
+                _ => match &path {
+                    Some(path) => ("a file of exactly this path", format!("only '{path}'")),
+                    None => ("an existing file", "none".to_owned()),
+                },
             };
             return Err(invalid(field_of(reference), expected, format!("{given} (strict mode)")));
         }
-        let advice = if reason == OUTSIDE { "; copy the file there" } else { "" };
+        let advice = if reason == OUTSIDE { "; copy the file into this folder" } else { "" };
         let treatment = path.as_ref().map_or_else(|| format!("{stand_in}{advice}"), |path| format!("'{path}' is read"));
         remarks.push(format!("{subject} {reason}: {treatment}"));
         Ok(path)
@@ -298,8 +301,8 @@ impl AssetDir {
         Ok(Self { base: self.resolve(relative)?, ..self.clone() })
     }
 
-    /// The folder `relative` of a scene or a model. Unless it is in the folder of the scene, it becomes this folder, which
-    /// paths in model files cannot leave.
+    /// The folder `relative` of a scene or a model. A folder outside of the folder of the scene becomes the new folder of
+    /// the scene, which paths in model files cannot leave.
     ///
     /// # Errors
     /// As for [`Self::resolve`].

@@ -235,7 +235,7 @@ mod tests {
             assert!(!message.contains(outside), "{source}: {message}");
         }
         let opened = repository.open("map", &MemoryReservation::unlimited()).expect("a scene without the library");
-        let remark = "material library '../../secret.mtl' is outside of the folder of the scene: the default color is drawn for its materials; copy the file there";
+        let remark = "material library '../../secret.mtl' is outside of the folder of the scene: the default color is drawn for its materials; copy the file into this folder";
         assert_eq!(opened.scene.remarks, [remark]);
         // Links out of the repository are not found, whether or not their targets exist.
         for source in ["link", "link/secret.obj", "link/absent.obj"] {

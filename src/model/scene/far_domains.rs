@@ -12,9 +12,9 @@ use crate::domain::{Domain, MAX_DIAGONALS, Mesh, Shape, origin_of_bounds};
 use crate::error::Result;
 use crate::rounding::to_significant_digits;
 
-/// The largest distance of a domain in diagonals of its own bounds. It is large, because far domains have floating
-/// origins of their own, which a frame pays for with a pass over all vertices on the host, and because only the place
-/// of the domain is rounded, not its shape: by at most 2^-24 x 2^16 = 0.4 % of its diagonal.
+/// Limit on the distance of a domain from the scene's origin, in diagonals of its own bounds. The limit is large for two
+/// reasons: floating origins cost a pass over all vertices on the host per frame, and up to it, f32 only shifts a domain,
+/// by at most 2^-24 x 2^16 = 0.4 % of its diagonal, and does not deform it.
 const MAX_OWN_DIAGONALS: f64 = 65_536.0;
 
 /// The largest error on an axis of a step with f32 transforms, in terms of the largest coordinate d of a domain.
@@ -127,13 +127,16 @@ pub(super) fn separate_far_domains(parts: &mut SceneParts) -> Result<FarDomains>
 /// A remark on the error of steps with f32 transforms, in a scene where it matters.
 fn far_remark(parts: &SceneParts, misplaced: &[(usize, f64)]) -> Option<String> {
     let (index, reach) = misplaced.iter().max_by(|a, b| a.1.total_cmp(&b.1))?;
-    let others = misplaced.len() - 1;
-    let more = if others > 0 { format!(" and {others} other domains are") } else { " is".to_owned() };
+    let others = match misplaced.len() - 1 {
+        0 => String::new(),
+        1 => ", another domain is far from it, too".to_owned(),
+        count => format!(", {count} other domains are far from it, too"),
+    };
     let [distance, error] =
         [*reach, *reach * F32_TRANSFORM_ERROR].map(|length| to_significant_digits(length * parts.meters_per_unit(), 2));
     Some(format!(
-        "'{}'{more} far from the origin ({distance} m): the rest state and f64 poses are exact, but a step with f32 \
-         transforms places it with an error of up to {error} m on each axis",
+        "'{}' is {distance} m from the origin{others}: steps with f32 transforms misplace it by up to {error} m on each \
+         axis; send poses in f64",
         parts.domains[*index].name
     ))
 }

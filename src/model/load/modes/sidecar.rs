@@ -50,8 +50,8 @@ pub(in crate::load) struct Sidecar {
 /// Finds the modes of the model `name` in its folder. A name consists of the name of the model, without extension and
 /// without `.derived`, and one of [`ENDINGS`]. If no file has such a name and the folder has no other model, the
 /// [`GENERIC_NAMES`] are tried. Letter case is ignored, unless a file has the exact name. A NumPy archive with a mesh is
-/// not used, because it is a model, whose U has the rows of its own vertices. Neither is an archive without U, unless its
-/// name says that it has modes: many programs write data of a model in an archive of the same name.
+/// skipped, because its U belongs to that mesh. An archive without U is skipped unless its name says that it has modes,
+/// because many programs write other data under the name of the model.
 ///
 /// # Errors
 /// `Invalid` for a name that leaves the root of the repository.

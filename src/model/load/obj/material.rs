@@ -50,7 +50,7 @@ pub(super) fn create_material(
     let exponent = number("Ns", statements.exponent, [0.0, MAX_EXPONENT]).filter(|exponent| *exponent > 1.0);
     remarks.extend(corrections.remarks(files.is_strict())?);
     if specular != [0.0; 3] && exponent.is_none() {
-        remarks.push(field_of("Ks is not used, because Ns is missing or at most 1"));
+        remarks.push(field_of("no highlight (Ks) is drawn, because Ns is missing or at most 1"));
     }
     let statements = &with_paths_of_images(statements, files, &field_of, remarks)?;
     let color_texture = load_color_texture(statements, files, texture_cache)
@@ -225,7 +225,7 @@ mod tests {
     #[test]
     fn highlights_need_an_illumination_model_and_an_exponent() {
         let folder = tempfile::tempdir().expect("a temporary folder");
-        let remark = "material 'm': Ks is not used, because Ns is missing or at most 1";
+        let remark = "material 'm': no highlight (Ks) is drawn, because Ns is missing or at most 1";
         for (statements, specular, remarks) in [
             ("Ns 20", 0.5, vec![]),
             ("Ns 1.5\nillum 2", 0.5, vec![]),

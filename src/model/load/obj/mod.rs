@@ -248,7 +248,7 @@ mod tests {
             (
                 "../no.mtl",
                 vec![
-                    "'../no.mtl' is outside of the folder of the scene: the default color is drawn for its materials; copy the file there",
+                    "'../no.mtl' is outside of the folder of the scene: the default color is drawn for its materials; copy the file into this folder",
                 ],
             ),
         ] {

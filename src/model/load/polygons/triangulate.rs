@@ -50,8 +50,8 @@ pub(super) fn triangulate(points: &[[f32; 3]]) -> Triangulation {
     }
 }
 
-/// Triangulates a polygon of which only the corners `distinct` have another place than the corner before them. A run of
-/// the others is filled by a fan from the corner before it.
+/// Triangulates a polygon with repeated points. `distinct` are the corners that differ from the corner before them. Each
+/// run of repetitions becomes a fan of triangles without area.
 fn triangulate_with_repetitions(points: &[[f32; 3]], distinct: &[usize]) -> Triangulation {
     let distinct_points: Vec<_> = distinct.iter().map(|index| points[*index]).collect();
     let Triangulation { mut triangles, is_inexact } = triangulate(&distinct_points);

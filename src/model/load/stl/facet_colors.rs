@@ -33,8 +33,8 @@ pub(super) fn decode(header: &[u8], attributes: impl Iterator<Item = u16> + Clon
     if colors.iter().any(Option::is_some) { colors } else { Vec::new() }
 }
 
-/// Whether words are colors although bit 15 of all of them selects the color of the body: they differ, or the body is one
-/// of MeshLab.
+/// Whether the words are colors although bit 15 of all is set, with which Magics selects the color of the body: the words
+/// differ, or MeshLab wrote the header.
 fn is_flagged_with_colors(body: [u8; 3], mut attributes: impl Iterator<Item = u16> + Clone) -> bool {
     let Some(first) = attributes.next() else { return false };
     let has_flags = first & FLAG != 0 && attributes.clone().all(|word| word & FLAG != 0);
