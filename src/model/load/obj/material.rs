@@ -1,7 +1,8 @@
 //! Converts MTL statements to Phong materials. Default colors: white for Kd, the value of Kd for Ka, black for Ks.
 //!
-//! Programs without ambient light write a gray as Ka, such as black, white or 0.2 of any Kd, so a gray also means Kd. A
-//! surface reflects no more of the skylight than of the sunlight, so Ka is at most Kd, unless Kd is black. There is no highlight with
+//! Programs without ambient light write a gray as Ka, such as black, white or 0.2 for any Kd, so a gray also means Kd,
+//! except in a material of black Kd without Ks and Ns. A surface reflects no more of the skylight than of the sunlight, so
+//! Ka is at most Kd, unless Kd is black. There is no highlight with
 //! `illum 0` and `illum 1`, or with an exponent Ns that is missing or at most 1, with which the highlight would cover the
 //! whole lit side; files use 0 for "not specified".
 
@@ -37,10 +38,11 @@ pub(super) fn create_material(
         corrections.color(&field_of(statement), color?, "the default is used")
     };
     let diffuse = color("Kd", statements.diffuse).unwrap_or([1.0; 3]);
-    let is_gray = |color: &[f32; 3]| color[0] == color[1] && color[1] == color[2];
-    let ambient = color("Ka", statements.ambient).filter(|color| !is_gray(color)).unwrap_or(diffuse);
-    let is_lit_by_sky_only = diffuse == [0.0; 3];
-    let limit = |channel: usize| if is_lit_by_sky_only { 1.0 } else { diffuse[channel] };
+    let is_black = diffuse == [0.0; 3];
+    let has_only_ambient = is_black && statements.specular.is_none() && statements.exponent.is_none();
+    let is_default = |color: &[f32; 3]| !has_only_ambient && color[0] == color[1] && color[1] == color[2];
+    let ambient = color("Ka", statements.ambient).filter(|color| !is_default(color)).unwrap_or(diffuse);
+    let limit = |channel: usize| if is_black { 1.0 } else { diffuse[channel] };
     let ambient = [0, 1, 2].map(|channel| ambient[channel].min(limit(channel)));
     let specular = color("Ks", statements.specular).filter(|_| !statements.is_matte).unwrap_or([0.0; 3]);
     let mut number = |statement: &str, value: Option<f32>, range: [f32; 2]| {
@@ -199,7 +201,13 @@ mod tests {
         let (default, ..) = read("newmtl m\nNs 0\n", folder.path()).expect("a valid material");
         assert_eq!((default.diffuse, default.ambient, default.specular), ([1.0; 3], [1.0; 3], [0.0; 3]));
         assert_eq!((default.shininess, default.alpha_mode), (1.0, AlphaMode::Opaque));
-        for (statement, ambient) in [("", [0.0; 3]), ("Ka 1 1 1\n", [0.0; 3]), ("Ka 0.5 0 0\n", [0.5, 0.0, 0.0])] {
+        for (statement, ambient) in [
+            ("", [0.0; 3]),
+            ("Ka 1 1 1\n", [1.0; 3]),
+            ("Ka 1 1 1\nNs 20\n", [0.0; 3]),
+            ("Ka 1 1 1\nKs 0 0 0\n", [0.0; 3]),
+            ("Ka 0.5 0 0\n", [0.5, 0.0, 0.0]),
+        ] {
             let (black, ..) = read(&format!("newmtl m\nKd 0 0 0\n{statement}"), folder.path()).expect("a material");
             assert_eq!((black.diffuse, black.ambient), ([0.0; 3], ambient), "{statement}");
         }
