@@ -2,9 +2,8 @@
 //!
 //! Programs without ambient light write a gray as Ka, such as black, white or 0.2 for any Kd, so a gray also means Kd,
 //! except in a material of black Kd without Ks and Ns. A surface reflects no more of the skylight than of the sunlight, so
-//! Ka is at most Kd, unless Kd is black. There is no highlight with
-//! `illum 0` and `illum 1`, or with an exponent Ns that is missing or at most 1, with which the highlight would cover the
-//! whole lit side; files use 0 for "not specified".
+//! Ka is at most Kd, unless Kd is black. There is no highlight with `illum 0` and `illum 1`, or with an exponent Ns that is
+//! missing or at most 1, with which the highlight would cover the whole lit side; files use 0 for "not specified".
 
 use super::mtl::MtlMaterial;
 use crate::domain::{AlphaMode, Material, Texture};
