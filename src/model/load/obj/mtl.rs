@@ -66,11 +66,7 @@ impl MtlMaterial {
             b"ka" => self.ambient = Some(self.parse_color(line, material_name)?),
             b"kd" => self.diffuse = Some(self.parse_color(line, material_name)?),
             b"ks" => self.specular = Some(self.parse_color(line, material_name)?),
-            b"ke" => {
-                if self.parse_color(line, material_name)?.iter().any(|channel| *channel > 0.0) {
-                    self.remarks.push(format!("material '{material_name}': emission (Ke) is ignored"));
-                }
-            }
+            b"ke" => self.note_emission(line, material_name)?,
             b"ns" => self.exponent = Some(parse_last_number(line)?),
             b"illum" => self.is_matte = parse_last_number(line)? < 2.0,
             b"d" => self.opacity = Some(parse_last_number(line)?),
@@ -101,6 +97,14 @@ impl MtlMaterial {
             }
             _ => Err(color_error()),
         }
+    }
+
+    /// Adds a remark on emission that is not black.
+    fn note_emission(&mut self, line: &[u8], material_name: &str) -> Result<()> {
+        let is_black = self.parse_color(line, material_name)?.iter().all(|channel| *channel == 0.0);
+        let remark = format!("material '{material_name}': emission (Ke) is ignored");
+        self.remarks.extend((!is_black).then_some(remark));
+        Ok(())
     }
 
     /// Sets the opacity to 1 - `Tr`, but ignores `Tr 1`: VTK writes the opacity as `Tr`, so its opaque surfaces would
