@@ -25,6 +25,15 @@ use crate::mcap_records::{
 /// Size limit of a chunk record: its records and its header.
 const MAX_CHUNK_RECORD_BYTES: u64 = MAX_CHUNK_BYTES + (64 << 10);
 
+/// The arrays of a shape that deform its surface, in both forms of its rest positions.
+pub(crate) const SURFACE_ARRAYS: [ShapeArray; 5] = [
+    ShapeArray::Indices,
+    ShapeArray::CornerVertices,
+    ShapeArray::RestPositions,
+    ShapeArray::CenteredPositions,
+    ShapeArray::Modes,
+];
+
 /// A file whose records are read by their offsets.
 pub(crate) struct RecordFile {
     path: PathBuf,

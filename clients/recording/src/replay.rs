@@ -5,15 +5,14 @@ use std::time::Duration;
 
 use modalcast_client::{
     ArrayUpload, Client, Delivery, DescriptionRequest, DriveRequest, Error as ClientError, Frame, FrameStream,
-    FrameStreamRequest, Picture, Reason, SceneDescription, SceneInfo, Shape, ShapeArray, StepStream, UploadDomain,
-    UploadShape,
+    FrameStreamRequest, Picture, Reason, SceneDescription, SceneInfo, Shape, StepStream, UploadDomain, UploadShape,
 };
 use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use crate::error::{Error, Result};
 use crate::format::metadata;
-use crate::reader::Recording;
+use crate::reader::{Recording, SURFACE_ARRAYS};
 use crate::step_source::{StepSource, TimeRange, TimedStep};
 use crate::steps::StepTarget;
 
@@ -124,14 +123,7 @@ async fn has_recorded_contents(client: &Client, recording: &Recording, name: &st
 
 /// The recorded meshes, modes and colors of all domains.
 fn array_upload(recording: &Recording, name: &str) -> Result<ArrayUpload> {
-    let arrays = [
-        ShapeArray::Indices,
-        ShapeArray::CornerVertices,
-        ShapeArray::RestPositions,
-        ShapeArray::CenteredPositions,
-        ShapeArray::Modes,
-    ];
-    let mut description = recording.read_description(&arrays, false)?;
+    let mut description = recording.read_description(&SURFACE_ARRAYS, false)?;
     let shapes = std::mem::take(&mut description.shapes);
     let SceneDescription { info, materials, domains, .. } = description;
     let mut shapes: Vec<Option<Shape>> = shapes.into_iter().map(Some).collect();

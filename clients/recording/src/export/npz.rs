@@ -5,13 +5,13 @@ use std::fs::File;
 use std::io::{BufWriter, Write as _};
 use std::path::Path;
 
-use modalcast_client::{SceneDescription, ShapeArray};
+use modalcast_client::SceneDescription;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use super::tracks::{StateTimes, for_each_track};
 use crate::error::{Error, Result};
-use crate::reader::Recording;
+use crate::reader::{Recording, SURFACE_ARRAYS};
 
 /// Writes a `.npz` file:
 ///
@@ -31,14 +31,7 @@ use crate::reader::Recording;
 /// `Unavailable` if the recording has only the hashes of its contents; `InvalidFile` if it is damaged; `File` if the
 /// file cannot be written.
 pub fn export_npz(recording: &Recording, out: &Path) -> Result<()> {
-    let arrays = [
-        ShapeArray::Indices,
-        ShapeArray::CornerVertices,
-        ShapeArray::RestPositions,
-        ShapeArray::CenteredPositions,
-        ShapeArray::Modes,
-    ];
-    let description = recording.read_description(&arrays, false)?;
+    let description = recording.read_description(&SURFACE_ARRAYS, false)?;
     let selected = StateTimes::read(recording)?;
     let file = File::create(out).map_err(|error| Error::open(out, &error))?;
     let mut archive = Archive { zip: ZipWriter::new(BufWriter::new(file)), path: out };

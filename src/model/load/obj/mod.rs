@@ -18,7 +18,7 @@ use crate::scene::SceneParts;
 
 /// The largest number of material names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
-/// What is drawn without a material library, for a remark.
+/// The stand-in for a missing material library, for a remark.
 const MISSING_LIBRARY: &str = "the default color is drawn for its materials";
 /// The largest number of names of undefined materials in a remark.
 const MAX_LISTED_UNDEFINED: usize = 8;

@@ -148,7 +148,7 @@ fn split_header(bytes: &[u8]) -> Option<(String, &[u8])> {
     }
 }
 
-/// Rejects lines that are no statements, because the parser does not say what is wrong with them.
+/// Rejects lines that are no statements. The parser would reject them with its debug text.
 fn check_keywords(header: &str) -> Result<()> {
     const KEYWORDS: [&str; 7] = ["ply", "format", "comment", "obj_info", "element", "property", "end_header"];
     let is_statement = |line: &str| line.is_empty() || KEYWORDS.contains(&line.split(' ').next().unwrap_or_default());
