@@ -20,6 +20,7 @@ import { Bar } from "./ui/bar";
 import { type CommandHandlers, createToolbar, listenToKeys } from "./ui/commands";
 import { CoordinateSection } from "./ui/coordinate_section";
 import { Cover } from "./ui/cover";
+import { coveredHeights } from "./ui/covered_heights";
 import { byId } from "./ui/dom";
 import { DomainSection } from "./ui/domain_section";
 import { ForceLines } from "./ui/force_lines";
@@ -280,9 +281,9 @@ export class App implements CommandHandlers {
     /** Frames a scene, unless the camera has framed it before: after a new connection the view stays. */
     private frameOnce(scene: SceneDescription): void {
         const { camera } = this.viewport;
-        const { eye, target } = camera;
+        const { eye, target, hasMoved } = camera;
         camera.setScene(scene);
-        if (this.framedScene === scene.info.scene) camera.look(eye, target);
+        if (this.framedScene === scene.info.scene && hasMoved) camera.look(eye, target);
         this.framedScene = scene.info.scene;
     }
 
@@ -328,6 +329,7 @@ export class App implements CommandHandlers {
         };
         this.bar.onPanel = this.togglePanel;
         this.panel.onToggle = (isOpen) => this.bar.setPanelOpen(isOpen);
+        viewport.camera.coveredHeights = () => coveredHeights(this.stage);
         viewport.camera.onChange = () => {
             viewport.invalidate();
             if (this.settings.pictures) this.pictures?.moveCamera(viewport.camera.toMessage());

@@ -1,7 +1,6 @@
 /** Plays recordings without a server: from the page itself, or from a file that the user drops onto it. */
 
 import type { App } from "./app";
-import { norm, subtract, type Vec3 } from "./scene/affine";
 import { Playback } from "./source/playback";
 import { decodeBase64, type Recording, readRecording } from "./source/recording";
 import { Timeline } from "./ui/timeline";
@@ -59,8 +58,6 @@ export class RecordingPlayer {
         const features = { pictures: false, forces: false, drive: false };
         const model = app.showScene(scene, arrays, "", { server: null, features });
         document.title = `${scene.info.scene} - modalcast`;
-        if (view && norm(subtract(view.eye as Vec3, view.target as Vec3)) > 0)
-            app.viewport.camera.look(view.eye as Vec3, view.target as Vec3);
         if (isCutOff) {
             const text = `${name} was cut off. \`modalcast recover\` repairs it; the steps before the end can be played.`;
             app.notices.show("recording", text, { severity: "warn" });
@@ -70,6 +67,9 @@ export class RecordingPlayer {
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);
+        // After the time line, which covers a part of the image.
+        if (view) app.viewport.camera.frameAs(view);
+        else app.viewport.camera.frame();
         playback.seek(0);
         playback.play();
     }

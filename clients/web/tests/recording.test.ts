@@ -1,98 +1,55 @@
 import assert from "node:assert/strict";
-import { createHash } from "node:crypto";
 import { test } from "node:test";
 import { create, toBinary } from "@bufbuild/protobuf";
 import { StreamForcesResponseSchema } from "../src/proto/modalcast/v1/forces_pb";
-import { DescribeSceneResponseSchema, ReadContentResponseSchema } from "../src/proto/modalcast/v1/scenes_pb";
-import { StateContent, StreamStatesResponseSchema } from "../src/proto/modalcast/v1/states_pb";
+import { StateContent } from "../src/proto/modalcast/v1/states_pb";
 import { ArrayKind, type SceneDescription } from "../src/scene/description";
-import { toHex } from "../src/scene/numbers";
 import { SceneModel } from "../src/scene/scene_model";
 import { lastIndexAt, Playback } from "../src/source/playback";
 import { decodeBase64, readRecording } from "../src/source/recording";
-import { type RecordedMessage, writeRecording } from "./recording_file";
+import { Contents, type RecordedMessage, sceneMessages, stateMessage, writeRecording } from "./recording_file";
 import { floats, fourDomains } from "./scene";
 
 /** The scene with arrays of hashes, and the contents in the order of the hashes. */
-function sceneWithContents(): { scene: SceneDescription; contents: Uint8Array[] } {
+function sceneWithContents(): { scene: SceneDescription; contents: Contents } {
     const scene = fourDomains();
-    const contents: Uint8Array[] = [];
-    const add = (bytes: Uint8Array) => {
-        contents.push(bytes);
-        return createHash("sha256").update(bytes).digest();
-    };
+    const contents = new Contents();
     for (const shape of scene.shapes) {
         const numbers = new Uint8Array(new Uint32Array([0, 1, 2]).buffer);
         const positions = floats(...Array.from({ length: 9 }, (_, i) => shape.shape + i));
         const modes = floats(...Array.from({ length: 9 * shape.rank }, (_, i) => i / 10));
-        const arrays: [ArrayKind, Uint8Array][] = [
+        shape.arrays = contents.add([
             [ArrayKind.INDICES, numbers],
             [ArrayKind.CORNER_VERTICES, numbers],
             [ArrayKind.REST_POSITIONS, positions],
             [ArrayKind.REST_NORMALS, positions],
             [ArrayKind.MODES, modes],
-        ];
-        shape.arrays = arrays.map(([array, bytes]) => {
-            const sha256 = bytes.length > 0 ? add(bytes) : new Uint8Array();
-            return { $typeName: "modalcast.v1.ArrayDescription", array, bytes: BigInt(bytes.length), sha256 };
-        });
+        ]);
     }
     return { scene, contents };
 }
 
 /** A state with q of domain 0 or, if it is complete, of all domains. */
-function state(number: number, q: number[], complete: boolean): Uint8Array {
-    const sections: [StateContent, Uint8Array][] = complete
-        ? [
-              [StateContent.Q_DOMAINS, new Uint8Array(new Uint32Array([0, 1]).buffer)],
-              [StateContent.Q, floats(...q, number)],
-          ]
-        : [
-              [StateContent.Q_DOMAINS, new Uint8Array(new Uint32Array([0]).buffer)],
-              [StateContent.Q, floats(...q)],
-          ];
-    let offset = 0n;
-    const parts = sections.map(([content, bytes]) => {
-        const part = { content, offset, bytes: BigInt(bytes.length) };
-        offset += part.bytes;
-        return part;
-    });
-    const data = new Uint8Array(sections.flatMap(([, bytes]) => [...bytes]));
-    const head = { step: { run: 1n, number: BigInt(number), time: number }, complete, sections: parts, total: offset };
-    return toBinary(
-        StreamStatesResponseSchema,
-        create(StreamStatesResponseSchema, { part: { case: "chunk", value: { head, offset: 0n, data } } }),
-    );
+function state(number: number, time: number, q: number[], complete: boolean): RecordedMessage {
+    const domains = complete ? [0, 1] : [0];
+    const sections: [StateContent, Uint8Array][] = [
+        [StateContent.Q_DOMAINS, new Uint8Array(new Uint32Array(domains).buffer)],
+        [StateContent.Q, floats(...q, ...(complete ? [number] : []))],
+    ];
+    return stateMessage(number, time, sections, complete);
 }
 
 /** Ten states, one every 0.5 s, of which every fourth is complete. q0 of domain 0 is the index of the state. */
 async function recording(contentsMode = "embedded"): Promise<Uint8Array> {
     const { scene, contents } = sceneWithContents();
-    const messages: RecordedMessage[] = [];
-    const describe = (part: Parameters<typeof create<typeof DescribeSceneResponseSchema>>[1]) =>
-        messages.push({
-            topic: "scene",
-            time: 0,
-            data: toBinary(DescribeSceneResponseSchema, create(DescribeSceneResponseSchema, part)),
-        });
-    describe({ part: { case: "scene", value: scene.info } });
-    describe({ part: { case: "shapes", value: { shapes: scene.shapes } } });
-    describe({ part: { case: "materials", value: { materials: scene.materials } } });
-    describe({ part: { case: "domains", value: { domains: scene.domains } } });
-    contents.forEach((bytes, item) => {
-        const response = create(ReadContentResponseSchema, { item, total: BigInt(bytes.length), data: bytes });
-        messages.push({ topic: "content", time: 0, data: toBinary(ReadContentResponseSchema, response) });
-    });
-    for (let index = 0; index < 10; index++) {
-        messages.push({ topic: "states", time: index / 2, data: state(index, [index, -index], index % 4 === 0) });
-    }
+    const messages = sceneMessages(scene, contents);
+    for (let index = 0; index < 10; index++) messages.push(state(index, index / 2, [index, -index], index % 4 === 0));
     const forces = create(StreamForcesResponseSchema, { forces: [{ owner: 3n }] });
     messages.push({ topic: "forces", time: 3, data: toBinary(StreamForcesResponseSchema, forces) });
-    const sha256 = contents.map((bytes) => toHex(createHash("sha256").update(bytes).digest())).join(" ");
     return writeRecording(messages, {
         recording: { version: "1", contents: contentsMode },
-        content: { sha256 },
-        view: { eye: "1 2 3", target: "0 0 0.5" },
+        content: { sha256: contents.sha256 },
+        view: { eye: "1 2 3", target: "0 0 0.5", field_of_view: "28", width: "1280", height: "720" },
     });
 }
 
@@ -106,7 +63,8 @@ test("a recording has scene, arrays, states, forces and view", async () => {
         [0, 0.5, 1, 1.5, 2, 2.5, 3, 3.5, 4, 4.5],
     );
     assert.deepEqual(states.map(({ isComplete }) => isComplete).slice(0, 5), [true, false, false, false, true]);
-    assert.deepEqual([forces.length, view, isCutOff], [1, { eye: [1, 2, 3], target: [0, 0, 0.5] }, false]);
+    assert.deepEqual([forces.length, isCutOff], [1, false]);
+    assert.deepEqual(view, { eye: [1, 2, 3], target: [0, 0, 0.5], fieldOfView: 28, aspect: 16 / 9 });
 });
 
 test("a sought time shows the state that playing to this time shows", async () => {

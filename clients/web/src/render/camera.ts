@@ -4,14 +4,10 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { CameraSchema } from "../proto/modalcast/v1/frames_pb";
-import { addScaled, cross, dot, subtract, type Vec3 } from "../scene/affine";
+import { addScaled, dot, subtract, type Vec3 } from "../scene/affine";
 import type { SceneDescription } from "../scene/description";
-import { at } from "../scene/numbers";
+import { FIELD_OF_VIEW, fitBox, fitPicture, type ImageArea, type PictureCamera } from "./framing";
 import { fromYUp, normalized, unitVector, upAxis } from "./lighting";
-
-/** Vertical field of view in degrees, and fraction of the image that a framed scene fills. The server uses the same. */
-const FIELD_OF_VIEW = 28;
-const IMAGE_FILL = 0.94;
 
 export type CameraMessage = MessageInitShape<typeof CameraSchema>;
 
@@ -19,6 +15,11 @@ export class OrbitCamera {
     readonly camera = new THREE.PerspectiveCamera(FIELD_OF_VIEW, 1, 0.1, 10);
     private controls: OrbitControls | null = null;
     private scene: SceneDescription | null = null;
+    private recordedView: PictureCamera | null = null;
+    /** Whether the camera has moved since it framed the scene. */
+    hasMoved = false;
+    /** How many pixels of the element other elements cover at its top and bottom. */
+    coveredHeights: () => Pick<ImageArea, "coveredTop" | "coveredBottom"> = () => ({ coveredTop: 0, coveredBottom: 0 });
     onChange: () => void = () => {};
 
     constructor(private readonly element: HTMLElement) {}
@@ -26,12 +27,16 @@ export class OrbitCamera {
     /** Frames a scene. The controls are created anew, because they read the up axis only once. */
     setScene(scene: SceneDescription): void {
         this.scene = scene;
+        this.recordedView = null;
         this.controls?.dispose();
         this.camera.up.set(...unitVector(upAxis(scene)));
         const controls = new OrbitControls(this.camera, this.element);
         controls.zoomToCursor = true;
         controls.enableDamping = false;
-        controls.addEventListener("change", () => this.onChange());
+        controls.addEventListener("change", () => {
+            this.hasMoved = true;
+            this.onChange();
+        });
         this.controls = controls;
         this.frame();
     }
@@ -48,27 +53,26 @@ export class OrbitCamera {
         if (this.controls) this.controls.enabled = isEnabled;
     }
 
-    /** Views the rest bounds from the front, slightly from above and from the side, as the server's default camera. */
+    /**
+     * Views the rest bounds: from the direction of the recorded view or, without one, from the front, slightly from above
+     * and from the side, as the server's default camera. The view follows the size of the element until the camera moves.
+     */
     frame(): void {
-        if (!this.scene || !this.controls) return;
+        if (!this.scene) return;
         const axis = upAxis(this.scene);
         const { bounds } = this.scene.info;
-        const toCamera = normalized(fromYUp([0.42, 0.14, 0.9], axis));
-        const center = [0, 1, 2].map((i) => (at(bounds, i) + at(bounds, 3 + i)) / 2) as Vec3;
-        const slope = IMAGE_FILL * Math.tan((FIELD_OF_VIEW / 2) * (Math.PI / 180));
-        const right = normalized(cross(unitVector(axis), toCamera));
-        const cameraUp = cross(toCamera, right);
-        let distance = 0;
-        for (let corner = 0; corner < 8; corner++) {
-            const point = [0, 1, 2].map((i) => at(bounds, i + ((corner >> i) & 1) * 3)) as Vec3;
-            const offset = subtract(point, center);
-            const width = Math.abs(dot(offset, right)) / (slope * this.camera.aspect);
-            distance = Math.max(
-                distance,
-                dot(offset, toCamera) + Math.max(width, Math.abs(dot(offset, cameraUp)) / slope),
-            );
-        }
-        this.look(addScaled(center, toCamera, distance > 0 ? distance : 1), center);
+        const { recordedView } = this;
+        const { eye, target } = recordedView
+            ? fitPicture(recordedView, bounds, unitVector(axis), this.imageArea)
+            : fitBox(bounds, normalized(fromYUp([0.42, 0.14, 0.9], axis)), unitVector(axis), this.imageArea);
+        this.look(eye, target);
+        this.hasMoved = false;
+    }
+
+    /** Frames the scene as a recorded picture does. */
+    frameAs(view: PictureCamera): void {
+        this.recordedView = view;
+        this.frame();
     }
 
     look(eye: Vec3, target: Vec3): void {
@@ -79,12 +83,21 @@ export class OrbitCamera {
         this.controls.minDistance = 1e-4 * distance;
         this.controls.maxDistance = 1e3 * distance;
         this.controls.update();
+        this.hasMoved = true;
         this.onChange();
     }
 
-    setAspect(aspect: number): void {
-        this.camera.aspect = aspect;
+    /** Adapts to the size of the element. */
+    resize(): void {
+        const { width, height } = this.imageArea;
+        this.camera.aspect = width / height;
         this.camera.updateProjectionMatrix();
+        if (!this.hasMoved) this.frame();
+    }
+
+    private get imageArea(): ImageArea {
+        const { clientWidth, clientHeight } = this.element;
+        return { width: Math.max(1, clientWidth), height: Math.max(1, clientHeight), ...this.coveredHeights() };
     }
 
     toMessage(): CameraMessage {

@@ -93,7 +93,7 @@ export class Viewport {
 
     private resize(): void {
         const [width, height] = this.pixelSize;
-        this.camera.setAspect(this.container.clientWidth / Math.max(1, this.container.clientHeight));
+        this.camera.resize();
         this.gl?.setSize(width, height, false);
         this.onResize();
         this.invalidate();

@@ -6,8 +6,11 @@ import { decompress } from "fzstd";
 import { type StreamForcesResponse, StreamForcesResponseSchema } from "../proto/modalcast/v1/forces_pb";
 import { DescribeSceneResponseSchema, ReadContentResponseSchema } from "../proto/modalcast/v1/scenes_pb";
 import { type StreamStatesResponse, StreamStatesResponseSchema } from "../proto/modalcast/v1/states_pb";
+import type { PictureCamera } from "../render/framing";
+import { norm, subtract, type Vec3 } from "../scene/affine";
 import { parseArrays, type SceneArrays } from "../scene/arrays";
 import { DescriptionCollector, type SceneDescription } from "../scene/description";
+import { at } from "../scene/numbers";
 
 /** Version of the format in the metadata record `recording`. */
 const FORMAT_VERSION = "1";
@@ -28,18 +31,13 @@ export interface RecordedForces {
     message: StreamForcesResponse;
 }
 
-/** The camera of the metadata record `view`. */
-export interface RecordedView {
-    eye: number[];
-    target: number[];
-}
-
 export interface Recording {
     scene: SceneDescription;
     arrays: SceneArrays;
     states: RecordedState[];
     forces: RecordedForces[];
-    view: RecordedView | null;
+    /** The picture of the metadata record `view`. */
+    view: PictureCamera | null;
     /** Whether the file ends without the records that close a recording. */
     isCutOff: boolean;
 }
@@ -109,14 +107,12 @@ class RecordingCollector {
         // The last state of a file that was cut off may lack chunks.
         const last = this.states.at(-1);
         if (last && !isWhole(last)) this.states.pop();
-        const view = this.metadata.get("view");
-        const numbers = (name: string) => (view?.get(name) ?? "").split(" ").map(Number);
         return {
             scene,
             arrays: parseArrays(scene, contents),
             states: this.states,
             forces: this.forces,
-            view: view ? { eye: numbers("eye"), target: numbers("target") } : null,
+            view: readView(this.metadata.get("view")),
             isCutOff,
         };
     }
@@ -127,6 +123,16 @@ class RecordingCollector {
         if (head) this.states.push({ time, messages: [message], isComplete: head.complete });
         else this.states.at(-1)?.messages.push(message);
     }
+}
+
+/** The picture of a metadata record; null if the record is missing, or has no direction. */
+function readView(record: Map<string, string> | undefined): PictureCamera | null {
+    const numbers = (name: string) => (record?.get(name) ?? "").split(" ").map(Number.parseFloat);
+    const number = (name: string) => at(numbers(name), 0);
+    const [eye, target] = [numbers("eye") as Vec3, numbers("target") as Vec3];
+    const view = { eye, target, fieldOfView: number("field_of_view"), aspect: number("width") / number("height") };
+    const isUsable = norm(subtract(eye, target)) > 0 && view.fieldOfView > 0 && view.aspect > 0;
+    return isUsable ? view : null;
 }
 
 function isWhole({ messages }: RecordedState): boolean {

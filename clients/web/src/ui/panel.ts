@@ -1,4 +1,4 @@
-/** The panels at the right side, or at the bottom of a phone. */
+/** The panels at the right side or, on a phone, a sheet at the bottom with a handle that closes it. */
 
 import { byId, h, setText } from "./dom";
 
@@ -6,6 +6,16 @@ export class Panel {
     private readonly element = byId("panel");
     private readonly sections = new Map<string, { section: HTMLDetailsElement; count: HTMLElement }>();
     onToggle: (isOpen: boolean) => void = () => {};
+
+    constructor() {
+        const handle = h("button", {
+            className: "handle",
+            title: "Close the panels",
+            aria: { label: "Close the panels" },
+        });
+        handle.onclick = () => (this.isOpen = false);
+        this.element.append(handle);
+    }
 
     add(title: string, body: HTMLElement, isOpen: boolean): void {
         const count = h("span", { className: "count" });

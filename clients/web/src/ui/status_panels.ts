@@ -34,7 +34,7 @@ export class StatusPanels {
     ) {
         const body = (element: HTMLElement) => h("div", { className: "body" }, element);
         panel.add("Forces", body(this.forces), false);
-        panel.add("Performance", body(this.performance.element), true);
+        panel.add("Performance", body(this.performance.element), false);
         panel.add("Scene", body(this.scene.element), false);
     }
 

@@ -30,7 +30,7 @@ export class Timeline {
             aria: { label: "Time in seconds" },
         });
         this.slider.oninput = () => playback.seek(Number(this.slider.value));
-        const total = h("output", { className: "total", textContent: format.seconds(playback.duration) });
+        const total = h("span", { className: "total", textContent: format.seconds(playback.duration) });
         const speed = h("select", { title: "Speed", aria: { label: "Speed" } });
         const speeds = [...new Set([...SPEEDS, playback.speed])].sort((a, b) => a - b);
         speed.append(
@@ -54,7 +54,7 @@ export class Timeline {
             playback.loops = !playback.loops;
             loop.setAttribute("aria-pressed", String(playback.loops));
         };
-        const ends = h("span", {}, this.now, " / ", total);
+        const ends = h("span", { className: "times" }, this.now, " / ", total);
         this.element = h(
             "div",
             { id: "timeline", className: "card", aria: { role: "group", label: "Time line" } },

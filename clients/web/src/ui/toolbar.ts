@@ -47,6 +47,19 @@ export class Toolbar {
     setVisible(id: string, isVisible: boolean): void {
         const button = this.buttons.get(id);
         if (button) button.hidden = !isVisible;
+        this.updateSeparators();
+    }
+
+    /** Hides the separators of groups without visible buttons before them. */
+    private updateSeparators(): void {
+        let hasButton = false;
+        for (const child of this.element.children as HTMLCollectionOf<HTMLElement>) {
+            if (child.className !== "separator") hasButton ||= !child.hidden;
+            else {
+                child.hidden = !hasButton;
+                hasButton = false;
+            }
+        }
     }
 
     private button({ id, icon: name, label, key, run, isToggle }: ToolAction): HTMLButtonElement {

@@ -1,7 +1,7 @@
 /** Starts servers, physics processes and browsers for tests, and ends them. */
 
 import { type ChildProcess, type StdioOptions, spawn } from "node:child_process";
-import { mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { mkdirSync, mkdtempSync, readFileSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { gunzipSync } from "node:zlib";
@@ -184,6 +184,15 @@ export async function openPage(browser: Browser, url: string, width = 480, heigh
 async function serveCommittedPage(page: Page): Promise<void> {
     const isPage = (url: URL) => url.protocol === "http:" && url.pathname === "/";
     await page.route(isPage, (route) => route.fulfill({ body: committedPage(), contentType: "text/html" }));
+}
+
+/** Folder for screenshots of some tests; empty: none. */
+const SCREENSHOTS = process.env["MODALCAST_SCREENSHOTS"] ?? "";
+
+export async function takeScreenshot(page: Page, name: string): Promise<void> {
+    if (!SCREENSHOTS) return;
+    mkdirSync(SCREENSHOTS, { recursive: true });
+    await page.screenshot({ path: join(SCREENSHOTS, `${name}.png`) });
 }
 
 /** Waits until the page shows a scene. */

@@ -2,7 +2,7 @@
 // argument, it runs those that take minutes (*.long.ts) instead.
 // MODALCAST_PROGRAMS: folder with the programs (default target/debug). MODALCAST_CHROMIUM: the browser.
 // MODALCAST_COMMITTED_PAGE: if set, servers show the page of dist instead of the one that they were built with.
-// MODALCAST_SCREENSHOTS: folder for screenshots of the tests of `modalcast view`.
+// MODALCAST_SCREENSHOTS: folder for screenshots of some tests.
 // Other arguments are passed to Node, for example --test-name-pattern=pull.
 import { spawnSync } from "node:child_process";
 import { readdirSync } from "node:fs";

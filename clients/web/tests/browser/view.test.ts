@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import type { ChildProcess } from "node:child_process";
-import { mkdirSync, readdirSync, readFileSync, writeFileSync } from "node:fs";
+import { readdirSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
@@ -12,6 +12,7 @@ import {
     openPage,
     printedUrl,
     startProgram,
+    takeScreenshot,
     temporaryFolder,
     type ViewerPage,
     waitForScene,
@@ -21,8 +22,6 @@ import { Beam } from "./model_files";
 const LIMIT_MS = 300_000;
 const WIDTH = 1000;
 const HEIGHT = 640;
-/** Folder for a screenshot of each test; empty: none. */
-const SCREENSHOTS = process.env["MODALCAST_SCREENSHOTS"] ?? "";
 
 let browser: Browser;
 const programs: ChildProcess[] = [];
@@ -56,12 +55,6 @@ async function close({ page, errors, program }: View): Promise<void> {
     await page.close();
     await end(program);
     assert.equal(program.exitCode, 0);
-}
-
-async function takeScreenshot(page: Page, name: string): Promise<void> {
-    if (!SCREENSHOTS) return;
-    mkdirSync(SCREENSHOTS, { recursive: true });
-    await page.screenshot({ path: join(SCREENSHOTS, `${name}.png`) });
 }
 
 /** The child processes of a program, zombies included: their numbers by their names. */
@@ -206,6 +199,7 @@ test("a stiff body is shown in slow motion, which the page names", { timeout: LI
     ] as const) {
         const shown = await view("fork.npz", fork, [...options]);
         const { page } = shown;
+        await page.locator("summary", { hasText: "Performance" }).click();
         const facts = page.locator(".facts tr", { hasText: "Time scale" });
         await facts.getByText(text ?? "real time", { exact: true }).waitFor();
         const bar = page.locator("#time-scale");
