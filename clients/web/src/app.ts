@@ -16,6 +16,7 @@ import { TimeScale } from "./scene/time_scale";
 import { SceneSession, type SceneSource } from "./session";
 import type { Playback } from "./source/playback";
 import type { PictureOptions } from "./source/server";
+import { AxesGizmo } from "./ui/axes_gizmo";
 import { Bar } from "./ui/bar";
 import { type CommandHandlers, createToolbar, listenToKeys } from "./ui/commands";
 import { CoordinateSection } from "./ui/coordinate_section";
@@ -29,6 +30,7 @@ import { Help } from "./ui/help";
 import { Notices } from "./ui/notices";
 import { Panel } from "./ui/panel";
 import { RemarksSection } from "./ui/remarks";
+import { ScaleBar } from "./ui/scale_bar";
 import { defaultSettings } from "./ui/settings";
 import { StatusPanels } from "./ui/status_panels";
 import type { Toolbar } from "./ui/toolbar";
@@ -51,6 +53,8 @@ export class App implements CommandHandlers {
     private readonly coordinates: CoordinateSection;
     private readonly domains = new DomainSection();
     private readonly forceLines = new ForceLines();
+    private readonly axes = new AxesGizmo((toCamera) => this.viewport.camera.lookAlong(toCamera));
+    private readonly scaleBar = new ScaleBar();
     private readonly pullGesture = new PullGesture(this.stage);
     private session: SceneSession | null = null;
     /** The recording that is shown; null for a server. */
@@ -337,7 +341,7 @@ export class App implements CommandHandlers {
         viewport.onResize = () => {
             if (this.settings.pictures && this.model) this.pictures?.start(this.pictureOptions());
         };
-        viewport.onFrame = () => this.forceLines.draw(viewport.camera);
+        viewport.onFrame = () => this.drawOverlays();
         viewport.onContextRestored = () => location.reload();
         pullGesture.tool = () => this.pull;
         pullGesture.onMove = () => viewport.invalidate();
@@ -346,6 +350,14 @@ export class App implements CommandHandlers {
                 severity: "warn",
             });
         this.stage.addEventListener("contextmenu", (event) => event.preventDefault());
+    }
+
+    private drawOverlays(): void {
+        const { camera } = this.viewport;
+        this.forceLines.draw(camera);
+        if (!this.model) return;
+        this.axes.draw(camera);
+        this.scaleBar.draw(camera.unitsPerPixel * this.model.scene.info.unit);
     }
 
     private updatePanels(): void {

@@ -4,10 +4,13 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { CameraSchema } from "../proto/modalcast/v1/frames_pb";
-import { addScaled, dot, subtract, type Vec3 } from "../scene/affine";
+import { addScaled, dot, norm, subtract, type Vec3 } from "../scene/affine";
 import type { SceneDescription } from "../scene/description";
 import { FIELD_OF_VIEW, fitBox, fitPicture, type ImageArea, type PictureCamera } from "./framing";
 import { fromYUp, normalized, unitVector, upAxis } from "./lighting";
+
+/** Tangent of the angle between the up axis and the direction of a view from above or below. */
+const TOP_VIEW_TILT = 1e-4;
 
 export type CameraMessage = MessageInitShape<typeof CameraSchema>;
 
@@ -16,6 +19,8 @@ export class OrbitCamera {
     private controls: OrbitControls | null = null;
     private scene: SceneDescription | null = null;
     private recordedView: PictureCamera | null = null;
+    /** The direction of the last framing; null for the default. */
+    private framedFrom: Vec3 | null = null;
     /** Whether the camera has moved since it framed the scene. */
     hasMoved = false;
     /** How many pixels of the element other elements cover at its top and bottom. */
@@ -41,6 +46,19 @@ export class OrbitCamera {
         this.frame();
     }
 
+    /** Length of a pixel of the element at the distance of the target, in scene units. */
+    get unitsPerPixel(): number {
+        const { clientHeight } = this.element;
+        const slope = Math.tan((this.camera.fov / 2) * (Math.PI / 180));
+        return (2 * slope * norm(subtract(this.eye, this.target))) / Math.max(1, clientHeight);
+    }
+
+    /** A direction of the world in the image: to the right, up, and towards the viewer. */
+    directionInView(direction: Vec3): Vec3 {
+        this.camera.updateMatrixWorld();
+        return new THREE.Vector3(...direction).transformDirection(this.camera.matrixWorldInverse).toArray() as Vec3;
+    }
+
     get target(): Vec3 {
         return this.controls ? (this.controls.target.toArray() as Vec3) : [0, 0, 0];
     }
@@ -54,17 +72,23 @@ export class OrbitCamera {
     }
 
     /**
-     * Views the rest bounds: from the direction of the recorded view or, without one, from the front, slightly from above
-     * and from the side, as the server's default camera. The view follows the size of the element until the camera moves.
+     * Views the rest bounds: from a direction, or from that of the recorded view. Without both, from the front, slightly
+     * from above and from the side, as the server's default camera. The view follows the size of the element until the
+     * camera moves.
+     *
+     * @param toCamera Unit vector.
      */
-    frame(): void {
+    frame(toCamera: Vec3 | null = null): void {
         if (!this.scene) return;
         const axis = upAxis(this.scene);
         const { bounds } = this.scene.info;
         const { recordedView } = this;
-        const { eye, target } = recordedView
-            ? fitPicture(recordedView, bounds, unitVector(axis), this.imageArea)
-            : fitBox(bounds, normalized(fromYUp([0.42, 0.14, 0.9], axis)), unitVector(axis), this.imageArea);
+        this.framedFrom = toCamera;
+        const direction = toCamera ?? normalized(fromYUp([0.42, 0.14, 0.9], axis));
+        const { eye, target } =
+            recordedView && !toCamera
+                ? fitPicture(recordedView, bounds, unitVector(axis), this.imageArea)
+                : fitBox(bounds, direction, unitVector(axis), this.imageArea);
         this.look(eye, target);
         this.hasMoved = false;
     }
@@ -73,6 +97,22 @@ export class OrbitCamera {
     frameAs(view: PictureCamera): void {
         this.recordedView = view;
         this.frame();
+    }
+
+    /**
+     * Views the scene along an axis of the world. A camera that has not moved since it framed the scene frames it again;
+     * another one keeps its target and distance.
+     */
+    lookAlong(toCamera: Vec3): void {
+        if (!this.scene) return;
+        const axis = upAxis(this.scene);
+        const isUp = toCamera[axis] !== 0;
+        // A camera above or below its target needs an up direction in the image: y or, if y is up, -z.
+        const tilt = fromYUp([0, 0, isUp ? TOP_VIEW_TILT : 0], axis);
+        const direction = normalized(addScaled(toCamera, tilt, 1));
+        if (!this.hasMoved) return this.frame(direction);
+        const distance = norm(subtract(this.eye, this.target));
+        this.look(addScaled(this.target, direction, distance), this.target);
     }
 
     look(eye: Vec3, target: Vec3): void {
@@ -92,7 +132,7 @@ export class OrbitCamera {
         const { width, height } = this.imageArea;
         this.camera.aspect = width / height;
         this.camera.updateProjectionMatrix();
-        if (!this.hasMoved) this.frame();
+        if (!this.hasMoved) this.frame(this.framedFrom);
     }
 
     private get imageArea(): ImageArea {

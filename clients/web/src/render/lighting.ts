@@ -72,6 +72,22 @@ export function lightingOf(scene: SceneDescription): Lighting {
     };
 }
 
+/** Largest light of the tone curve. */
+const LARGEST_LIGHT = 65504;
+
+/** The light that is displayed as a linear value from 0 to 1: the inverse of the tone curve. */
+export function lightOf(displayed: number, { exposure, tone }: Pick<Lighting, "exposure" | "tone">): number {
+    return Math.min(inverseTone(displayed, tone) / exposure, LARGEST_LIGHT);
+}
+
+function inverseTone(displayed: number, tone: number): number {
+    if (tone === 1) return displayed / (1 - displayed);
+    if (tone !== 2) return displayed;
+    // The positive root of x (2.51 x + 0.03) = displayed (x (2.43 x + 0.59) + 0.14).
+    const [a, b, c] = [2.51 - 2.43 * displayed, 0.03 - 0.59 * displayed, -0.14 * displayed];
+    return (-b + Math.sqrt(b * b - 4 * a * c)) / (2 * a);
+}
+
 /** x, y and z axes of the sun's shadow map. z points to the sun. */
 export function lightAxes(toSun: Vec3, up: Vec3): [Vec3, Vec3, Vec3] {
     let x = cross(up, toSun);

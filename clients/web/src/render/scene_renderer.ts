@@ -10,7 +10,7 @@ import { errorBound } from "../scene/packed_modes";
 import type { SceneState } from "../scene/state";
 import { Deformer, type DomainDisplay } from "./deformer";
 import { FullscreenPass } from "./fullscreen_pass";
-import { fitLightBox, type Lighting, lightAxes, lightingOf, unitVector, upAxis } from "./lighting";
+import { fitLightBox, type Lighting, lightAxes, lightingOf, lightOf, unitVector, upAxis } from "./lighting";
 import { BACKGROUND_FRAGMENT, PLAIN_FRAGMENT } from "./shaders";
 import { Surfaces, type Uniforms } from "./surfaces";
 import { Transparency } from "./transparency";
@@ -24,14 +24,19 @@ const ORIGIN_DISTANCE = 64;
 
 export type ColorChoice = { kind: "shaded" } | { kind: "displacement" } | { kind: "mode"; mode: number };
 
+/** The sky and ground of the scene, or a plain color for pictures in documents. */
+export type BackgroundChoice = "scene" | "gray" | "white";
+
 export interface RenderOptions {
     shadows: boolean;
     edges: boolean;
     color: ColorChoice;
+    background: BackgroundChoice;
 }
 
-/** Linear gray behind color maps, as the server's. */
+/** Linear gray behind color maps, as the server's, and linear white. */
 const PLAIN_GRAY = 0.87;
+const WHITE = 1;
 
 export class SceneRenderer {
     readonly deformer: Deformer;
@@ -51,7 +56,7 @@ export class SceneRenderer {
     private spheres: DomainSphere[] = [];
     private state: SceneState | null = null;
     private origin: Vec3 = [0, 0, 0];
-    private options: RenderOptions = { shadows: true, edges: false, color: { kind: "shaded" } };
+    private options: RenderOptions = { shadows: true, edges: false, color: { kind: "shaded" }, background: "scene" };
     private display: DomainDisplay = { hidden: new Set(), highlighted: null };
     private needsShadow = true;
     private needsDeformation = true;
@@ -102,10 +107,20 @@ export class SceneRenderer {
         // Color maps have no tone curve.
         this.setUniform(this.tone, "exposure", isMap ? 1 : this.lighting.exposure);
         this.setUniform(this.tone, "tone", isMap ? 0 : this.lighting.tone);
-        this.background.mesh.visible = !isMap;
-        this.plain.mesh.visible = isMap;
+        const isPlain = isMap || options.background !== "scene";
+        this.background.mesh.visible = !isPlain;
+        this.plain.mesh.visible = isPlain;
+        this.plain.setUniform("plain", this.plainLight());
         this.colorScale = 0;
         if (this.state) this.update(this.state);
+    }
+
+    /** The light of a plain background, of which the tone curve makes the displayed color. */
+    private plainLight(): THREE.Vector3 {
+        const displayed = this.options.background === "white" ? WHITE : PLAIN_GRAY;
+        const isMap = this.options.color.kind !== "shaded";
+        const light = this.needsBlending && !isMap ? lightOf(displayed, this.lighting) : displayed;
+        return new THREE.Vector3(light, light, light);
     }
 
     setDisplay(display: DomainDisplay): void {

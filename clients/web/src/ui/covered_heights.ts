@@ -3,9 +3,11 @@
 import { byId } from "./dom";
 
 export function coveredHeights(stage: HTMLElement): { coveredTop: number; coveredBottom: number } {
-    const { top, bottom } = stage.getBoundingClientRect();
+    const view = stage.getBoundingClientRect();
+    const [bar, dock] = ["bar", "dock"].map((id) => byId(id).getBoundingClientRect()) as [DOMRect, DOMRect];
+    // A hidden element has no height.
     return {
-        coveredTop: Math.max(0, byId("bar").getBoundingClientRect().bottom - top),
-        coveredBottom: Math.max(0, bottom - byId("dock").getBoundingClientRect().top),
+        coveredTop: bar.height > 0 ? Math.max(0, bar.bottom - view.top) : 0,
+        coveredBottom: dock.height > 0 ? Math.max(0, view.bottom - dock.top) : 0,
     };
 }

@@ -1,6 +1,6 @@
 /** What the user has chosen. */
 
-import type { ColorChoice } from "../render/scene_renderer";
+import type { BackgroundChoice, ColorChoice } from "../render/scene_renderer";
 
 export interface Settings {
     /** Whether the server draws. */
@@ -9,8 +9,16 @@ export interface Settings {
     shadows: boolean;
     edges: boolean;
     color: ColorChoice;
+    background: BackgroundChoice;
 }
 
 export function defaultSettings(): Settings {
-    return { pictures: false, jpeg: true, shadows: true, edges: false, color: { kind: "shaded" } };
+    return {
+        pictures: false,
+        jpeg: true,
+        shadows: true,
+        edges: false,
+        color: { kind: "shaded" },
+        background: "scene",
+    };
 }

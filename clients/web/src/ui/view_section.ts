@@ -1,5 +1,6 @@
 /** The panel section that selects whether the browser or the server draws, and what. */
 
+import type { BackgroundChoice } from "../render/scene_renderer";
 import { h, setText } from "./dom";
 import type { Settings } from "./settings";
 
@@ -14,6 +15,7 @@ export class ViewSection {
     private readonly jpegRow: HTMLElement;
     private readonly edges: HTMLInputElement;
     private readonly shadows: HTMLInputElement;
+    private readonly background: HTMLSelectElement;
     private readonly jpeg: HTMLSelectElement;
     private readonly switchRow: HTMLElement;
     onChange: () => void = () => {};
@@ -60,6 +62,15 @@ export class ViewSection {
             h("label", { htmlFor: "format", textContent: "Pictures" }),
             this.jpeg,
         );
+        this.background = h(
+            "select",
+            { id: "background" },
+            h("option", { value: "scene", textContent: "Sky and ground" }),
+            h("option", { value: "gray", textContent: "Light gray" }),
+            h("option", { value: "white", textContent: "White" }),
+        );
+        this.background.onchange = () =>
+            this.set(() => (settings.background = this.background.value as BackgroundChoice));
         const checks = h(
             "div",
             { className: "checks" },
@@ -73,6 +84,12 @@ export class ViewSection {
             this.hint,
             h("div", { className: "row" }, h("label", { htmlFor: "color", textContent: "Color" }), this.color),
             this.modeRow,
+            h(
+                "div",
+                { className: "row" },
+                h("label", { htmlFor: "background", textContent: "Background" }),
+                this.background,
+            ),
             this.jpegRow,
             checks,
         );
@@ -111,6 +128,8 @@ export class ViewSection {
         this.modeRow.hidden = settings.color.kind !== "mode";
         this.jpegRow.hidden = !settings.pictures;
         this.shadows.disabled = settings.pictures || settings.color.kind !== "shaded";
+        // The server draws the background of its pictures.
+        this.background.disabled = settings.pictures;
         this.edges.checked = settings.edges;
         this.shadows.checked = settings.shadows;
     }

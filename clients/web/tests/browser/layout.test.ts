@@ -1,38 +1,15 @@
 /** The page on a desktop and on a phone: the view fits beside the panels. A recording is played, without a server. */
 
 import assert from "node:assert/strict";
-import { writeFileSync } from "node:fs";
-import { join } from "node:path";
-import { after, before, test } from "node:test";
-import { pathToFileURL } from "node:url";
-import type { Browser, Page } from "playwright-core";
-import { beamRecording } from "./beam_recording";
-import { committedPage, launchBrowser, openPage, takeScreenshot, temporaryFolder, waitForScene } from "./harness";
+import { test } from "node:test";
+import type { Page } from "playwright-core";
+import { BeamSetup } from "./beam_setup";
+import { takeScreenshot } from "./harness";
 
 const LIMIT_MS = 120_000;
 const DESKTOP = [1280, 800] as const;
 const PHONE = [390, 844] as const;
-const folder = temporaryFolder();
-const file = join(folder, "beam.html");
-
-let browser: Browser;
-before(async () => {
-    const base64 = Buffer.from(await beamRecording()).toString("base64");
-    const element = `<script id="recording" type="application/octet-stream">${base64}</script>`;
-    writeFileSync(
-        file,
-        committedPage().replace("<!--RECORDING-->", () => element),
-    );
-    browser = await launchBrowser();
-});
-after(async () => browser?.close());
-
-async function open(width: number, height: number): Promise<{ page: Page; errors: string[] }> {
-    const opened = await openPage(browser, pathToFileURL(file).href, width, height);
-    await waitForScene(opened.page);
-    await opened.page.getByRole("button", { name: "Pause" }).click();
-    return opened;
-}
+const setup = new BeamSetup();
 
 interface Box {
     left: number;
@@ -90,7 +67,7 @@ async function checkFit(page: Page, name: string): Promise<void> {
 }
 
 test("a recording fits into the page of a desktop", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await open(...DESKTOP);
+    const { page, errors } = await setup.open(...DESKTOP);
     await checkFit(page, "layout-desktop");
     assert.equal((await elementBox(page, "#panel")).left, (await elementBox(page, "#stage")).right);
     await page.keyboard.press("b");
@@ -101,7 +78,7 @@ test("a recording fits into the page of a desktop", { timeout: LIMIT_MS }, async
 });
 
 test("a recording fits into the page of a phone, beside the panels too", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await open(...PHONE);
+    const { page, errors } = await setup.open(...PHONE);
     assert.equal(await page.locator("#panel").isVisible(), false, "expected closed panels at first");
     await checkFit(page, "layout-phone");
     await page.getByRole("button", { name: "Panels", exact: true }).click();
@@ -120,7 +97,7 @@ test("a recording fits into the page of a phone, beside the panels too", { timeo
 });
 
 test("a view that the user has turned stays when the page changes its size", { timeout: LIMIT_MS }, async () => {
-    const { page, errors } = await open(...PHONE);
+    const { page, errors } = await setup.open(...PHONE);
     const eye = () => page.evaluate(() => modalcastViewer.viewport.camera.eye);
     const framed = await eye();
     await page.mouse.move(200, 400);
@@ -141,7 +118,7 @@ test("a view that the user has turned stays when the page changes its size", { t
 
 test("the time line shows the current and the total time", { timeout: LIMIT_MS }, async () => {
     for (const [width, height] of [DESKTOP, PHONE]) {
-        const { page } = await open(width, height);
+        const { page } = await setup.open(width, height);
         await page.getByRole("slider", { name: "Time in seconds" }).evaluate((slider) => {
             (slider as HTMLInputElement).value = "0.5";
             slider.dispatchEvent(new Event("input"));
@@ -155,7 +132,7 @@ test("the time line shows the current and the total time", { timeout: LIMIT_MS }
 });
 
 test("the panel on performance is closed at first", { timeout: LIMIT_MS }, async () => {
-    const { page } = await open(...DESKTOP);
+    const { page } = await setup.open(...DESKTOP);
     const row = page.locator(".facts tr", { hasText: "Frames drawn" });
     assert.equal(await row.isVisible(), false);
     await page.locator("summary", { hasText: "Performance" }).click();
