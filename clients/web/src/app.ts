@@ -18,6 +18,7 @@ import type { Playback } from "./source/playback";
 import type { PictureOptions } from "./source/server";
 import { AxesGizmo } from "./ui/axes_gizmo";
 import { Bar } from "./ui/bar";
+import { Capture } from "./ui/capture";
 import { type CommandHandlers, createToolbar, listenToKeys } from "./ui/commands";
 import { CoordinateSection } from "./ui/coordinate_section";
 import { Cover } from "./ui/cover";
@@ -47,6 +48,7 @@ export class App implements CommandHandlers {
     readonly status: StatusPanels;
     private readonly remarks: RemarksSection;
     private readonly toolbar: Toolbar;
+    private readonly capture: Capture;
     private readonly panel = new Panel();
     private readonly help = new Help();
     private readonly view = new ViewSection(this.settings);
@@ -77,7 +79,9 @@ export class App implements CommandHandlers {
         this.panel.add("Coordinates", this.coordinates.element, true);
         this.panel.add("Domains", this.domains.element, false);
         this.status = new StatusPanels(this.panel, this.settings, this.viewport);
+        this.capture = new Capture(this.viewport, this.status.legend, this.notices);
         this.toolbar = createToolbar(this);
+        this.capture.onRecording = (isRecording) => this.toolbar.setPressed("video", isRecording);
         listenToKeys(this);
         this.connectEvents();
         if (window.innerWidth <= 720) this.panel.isOpen = false;
@@ -220,6 +224,15 @@ export class App implements CommandHandlers {
         this.change(() => (this.settings.pictures = !this.settings.pictures));
     };
 
+    savePicture = (): void => void this.capture.savePicture(this.fileName);
+
+    toggleVideo = (): void => void this.capture.toggleVideo(this.fileName);
+
+    /** Name of saved files, without extension. */
+    private get fileName(): string {
+        return this.model?.scene.info.scene ?? "modalcast";
+    }
+
     nextColor = (): void => {
         if (!this.model || this.model.layout.coordinates === 0) return;
         const { settings } = this;
@@ -301,6 +314,7 @@ export class App implements CommandHandlers {
         }
         if (settings.pictures) session?.pictures?.start(this.pictureOptions());
         else session?.pictures?.stop();
+        this.capture.followView(this.fileName);
         this.toolbar.setPressed("pictures", settings.pictures);
         viewport.invalidate();
     }

@@ -14,6 +14,8 @@ export class Viewport {
     readonly isSoftware: boolean;
     private sceneRenderer: SceneRenderer | null = null;
     private needsFrame = true;
+    /** Whether frames are drawn although nothing has changed. */
+    drawsAlways = false;
     /** When the frames of the last second were drawn, in milliseconds of `performance.now()`. */
     private frameTimes: number[] = [];
     private contextLost = false;
@@ -101,7 +103,11 @@ export class Viewport {
 
     private loop(): void {
         requestAnimationFrame(() => this.loop());
-        if (!this.needsFrame) return;
+        if (this.needsFrame || this.drawsAlways) this.draw();
+    }
+
+    /** Draws a frame. Its pixels can be read until the current task ends. */
+    draw(): void {
         this.needsFrame = false;
         this.onFrame();
         if (!this.sceneRenderer || this.contextLost) return;

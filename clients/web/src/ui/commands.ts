@@ -12,6 +12,8 @@ export interface CommandHandlers {
     frameScene(): void;
     copyCamera(): void;
     togglePictures(): void;
+    savePicture(): void;
+    toggleVideo(): void;
     nextColor(): void;
     toggleEdges(): void;
     toggleShadows(): void;
@@ -45,6 +47,17 @@ export function createToolbar(handlers: CommandHandlers): Toolbar {
                 isToggle: true,
             },
         ],
+        [
+            { id: "save", icon: "camera", label: "Save a picture", key: "I", run: handlers.savePicture },
+            {
+                id: "video",
+                icon: "video",
+                label: "Record a video",
+                key: "R",
+                run: handlers.toggleVideo,
+                isToggle: true,
+            },
+        ],
         [{ id: "help", icon: "help", label: "Help", key: "?", run: handlers.toggleHelp }],
     ]);
 }
@@ -59,6 +72,8 @@ export function listenToKeys(handlers: CommandHandlers): void {
         f: handlers.frameScene,
         c: handlers.copyCamera,
         v: handlers.togglePictures,
+        i: handlers.savePicture,
+        r: handlers.toggleVideo,
         m: handlers.nextColor,
         e: handlers.toggleEdges,
         s: handlers.toggleShadows,

@@ -17,6 +17,8 @@ const KEYS: [string, string][] = [
     ["F", "frame the scene"],
     ["C", "copy the camera as Python"],
     ["V", "switch between this browser and the server's pictures"],
+    ["I", "save a picture of the view as PNG"],
+    ["R", "start a video of the view, or end and save it"],
     ["M", "next color map"],
     ["E", "mesh edges"],
     ["S", "shadows"],

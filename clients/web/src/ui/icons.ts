@@ -9,6 +9,8 @@ const PATHS = {
     frame: "M4 9V4h5M15 4h5v5M20 15v5h-5M9 20H4v-5M9 12h6M12 9v6",
     copy: "M9 9h10v11H9zM5 15V4h10",
     picture: "M4 5h16v14H4zM4 16l5-5 4 4 3-3 4 4",
+    camera: "M4 8h3l2-3h6l2 3h3v11H4zM12 10a3.500 3.500 0 1 0 0 7a3.500 3.500 0 1 0 0-7",
+    video: "M3 7h12v10H3zM15 11l6-3v8l-6-3",
     help: "M9.2 9a3 3 0 1 1 4.3 2.7c-.9.5-1.5 1.100-1.500 2.300M12 17.500v.1M12 3a9 9 0 1 0 0 18a9 9 0 1 0 0-18",
     panel: "M4 5h16v14H4zM15 5v14",
     close: "M6 6l12 12M18 6L6 18",

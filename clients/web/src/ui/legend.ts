@@ -29,4 +29,24 @@ export class Legend {
     hide(): void {
         this.element.hidden = true;
     }
+
+    /** Draws the visible legend into the lower left corner of a picture. `scale`: pixels of the picture per CSS pixel. */
+    paint(context: CanvasRenderingContext2D, scale: number): void {
+        if (this.element.hidden) return;
+        const [margin, width, bar] = [14, 184, 10];
+        context.save();
+        context.scale(scale, scale);
+        context.translate(margin, context.canvas.height / scale - margin);
+        const gradient = context.createLinearGradient(0, 0, width, 0);
+        VIRIDIS.forEach((color, index) => gradient.addColorStop(index / (VIRIDIS.length - 1), color));
+        context.fillStyle = gradient;
+        context.fillRect(0, -16 - bar, width, bar);
+        context.fillStyle = "#16202e";
+        context.font = "13px system-ui, sans-serif";
+        context.fillText(this.title.textContent ?? "", 0, -22 - bar);
+        context.fillText("0", 0, 0);
+        context.textAlign = "right";
+        context.fillText(this.end.textContent ?? "", width, 0);
+        context.restore();
+    }
 }

@@ -22,7 +22,7 @@ export class StatusPanels {
     latency = 0;
     /** Seconds of the motion per second of real time; null if unknown. */
     timeScale: number | null = null;
-    private readonly legend = new Legend();
+    readonly legend = new Legend();
     private readonly scene = new FactsTable();
     private readonly performance = new FactsTable();
     private readonly forces = h("p", { className: "hint", textContent: "Nobody pulls." });

@@ -63,7 +63,8 @@ export class Toolbar {
     }
 
     private button({ id, icon: name, label, key, run, isToggle }: ToolAction): HTMLButtonElement {
-        const button = h("button", { className: "icon", title: `${label} (${key})`, aria: { label } }, icon(name));
+        const properties = { className: "icon", title: `${label} (${key})`, aria: { label }, data: { id } };
+        const button = h("button", properties, icon(name));
         if (isToggle) button.setAttribute("aria-pressed", "false");
         button.onclick = run;
         this.buttons.set(id, button);

@@ -55,6 +55,8 @@ async function checkFit(page: Page, name: string): Promise<void> {
     // The view follows the size of the page with the next frame.
     await page.evaluate(() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done))));
     const [scene, free] = [await sceneBox(page), await freeBox(page)];
+    const tools = await elementBox(page, "#tools");
+    assert.ok(tools.left >= free.left && tools.right <= free.right, `${name}: expected all buttons on the page`);
     await takeScreenshot(page, name);
     const text = `${name}: scene ${JSON.stringify(scene)}, free area ${JSON.stringify(free)}`;
     assert.ok(scene.left >= free.left && scene.right <= free.right, text);
@@ -93,6 +95,14 @@ test("a recording fits into the page of a phone, beside the panels too", { timeo
     await page.setViewportSize({ width: PHONE[1], height: PHONE[0] });
     await checkFit(page, "layout-phone-landscape");
     assert.deepEqual(errors, []);
+    await page.close();
+});
+
+test("the buttons of a live scene fit into the page of a phone", { timeout: LIMIT_MS }, async () => {
+    const { page } = await setup.open(...PHONE);
+    await page.evaluate(() => modalcastViewer.setPlayback(null));
+    await checkFit(page, "layout-phone-live");
+    assert.ok(await page.getByRole("button", { name: "Pull on the surface" }).isVisible());
     await page.close();
 });
 

@@ -7,6 +7,9 @@ import type { SurfacePoint } from "../../src/control/surface_point";
 import { Delivery } from "../../src/proto/modalcast/v1/common_pb";
 import { FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
 import type { CameraMessage } from "../../src/render/camera";
+import { fitBox } from "../../src/render/framing";
+import { normalized } from "../../src/render/lighting";
+import type { Vec3 } from "../../src/scene/affine";
 import { parseArrays } from "../../src/scene/arrays";
 import { Kinematics } from "../../src/scene/kinematics";
 import { SceneModel } from "../../src/scene/scene_model";
@@ -66,16 +69,15 @@ function waitForStep(page: Page, number: bigint): Promise<unknown> {
 }
 
 /**
- * Moves the camera towards its target, to a fraction of the distance. From far away, the holes of cut-out leaves are
- * smaller than a pixel, and depend on how a renderer filters textures.
+ * Views the tree from a fraction of the distance of the server's default camera. From far away, the holes of cut-out leaves
+ * are smaller than a pixel, and depend on how a renderer filters textures.
  */
-function moveCloser(page: Page, fraction: number): Promise<void> {
-    return page.evaluate((weight) => {
-        const { camera } = modalcastViewer.viewport;
-        const { eye, target } = camera;
-        const closer = eye.map((value, axis) => (target[axis] ?? 0) + weight * (value - (target[axis] ?? 0)));
-        camera.look(closer as [number, number, number], target);
-    }, fraction);
+async function viewFrom(page: Page, fraction: number): Promise<void> {
+    const { bounds } = (await (await server.client()).describe("tree")).info;
+    const area = { width: WIDTH, height: HEIGHT, coveredTop: 0, coveredBottom: 0 };
+    const { eye, target } = fitBox(bounds, normalized([0.42, 0.14, 0.9]), [0, 1, 0], area);
+    const closer = eye.map((value, axis) => (target[axis] ?? 0) + fraction * (value - (target[axis] ?? 0))) as Vec3;
+    await page.evaluate(([from, to]) => modalcastViewer.viewport.camera.look(from, to), [closer, target] as const);
 }
 
 /** The domain at each pixel, drawn by the browser. */
@@ -161,7 +163,7 @@ test("the browser draws the same domains and points as the server", { timeout: L
     const number = await bend(1);
     const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await waitForStep(page, number);
-    await moveCloser(page, 0.08);
+    await viewFrom(page, 0.08);
     const camera = await cameraOf(page);
     const [drawn, reference] = [await drawnDomains(page), await referenceDomains(camera)];
     const same = iou(drawn, reference);
