@@ -1,13 +1,14 @@
 /** Shows scenes of a server, and connects again after the connection has broken. */
 
 import type { App } from "./app";
+import { uploadScene } from "./control/scene_upload";
 import { Feature } from "./proto/modalcast/v1/server_pb";
 import { contentBytes, parseArrays, type SceneArrays } from "./scene/arrays";
 import type { SceneDescription } from "./scene/description";
 import type { SceneModel } from "./scene/scene_model";
 import type { SourceFeatures } from "./session";
 import { ContentCache } from "./source/content_cache";
-import { PROTOCOL_VERSION, Server } from "./source/server";
+import { PROTOCOL_VERSION, Server, type UploadedFile } from "./source/server";
 import * as format from "./ui/format";
 import { Channel } from "./wire/channel";
 import { RpcError, StatusCode } from "./wire/rpc_error";
@@ -18,6 +19,19 @@ const LONGEST_RETRY_MS = 4000;
 /** Milliseconds between pings, which measure the round trip, and between lists of the scenes while none is shown. */
 const PING_MS = 2000;
 
+/** What the user can do without a scene. */
+const CHOICE = "Choose one of these, drop a model file onto this page, or send a scene with the Python package.";
+/** Milliseconds for which the page says why it does not upload. */
+const NOTICE_MS = 12_000;
+/** Why dropped files are not uploaded. */
+const NO_UPLOAD = {
+    noServer:
+        "This page has no server that could read a model. It plays recordings: files that end in .mcap. `modalcast view FILE` opens a model.",
+    left: "The page has left its server to play a recording. Load the page again to open a model.",
+    disconnected: "There is no connection to the server at present. Drop the files again when it is back.",
+    busy: "Another upload is in progress. Drop the files again when it has ended.",
+} as const;
+
 /** An error that would occur again at the next attempt to connect. */
 class FatalError extends Error {}
 
@@ -25,6 +39,7 @@ export class LiveViewer {
     private switchScene: () => void = () => {};
     private isConnected = false;
     private isStopped = false;
+    private isUploading = false;
     /** The list of scenes that is offered, as JSON; empty while a scene is shown. */
     private offered = "";
 
@@ -197,16 +212,45 @@ export class LiveViewer {
         const choices = [
             ...open.map(([name, source]) => ({
                 label: name,
-                detail: `open, from ${source}`,
+                detail: format.sceneOrigin(source),
                 run: () => void this.select(`open:${name}`),
             })),
             ...sources.map((source) => ({
                 label: source,
-                detail: "open it",
+                detail: "Not open yet. The server can open it.",
                 run: () => void this.select(`source:${source}`),
             })),
         ];
-        app.cover.showChoices(title, `${problem}Open one of these, or send one with the Python package.`, choices);
+        app.cover.showChoices(title, `${problem}${CHOICE}`, choices);
+    }
+
+    /** Uploads files that the user has dropped onto the page, and shows their scene. */
+    async upload(files: readonly UploadedFile[]): Promise<void> {
+        const { app, server } = this;
+        const show = (text: string) => app.notices.show("upload", text, { severity: "warn", duration: NOTICE_MS });
+        if (this.isStopped) return show(this.isConnected ? NO_UPLOAD.left : NO_UPLOAD.noServer);
+        if (!server) return show(this.isConnected ? NO_UPLOAD.disconnected : NO_UPLOAD.noServer);
+        if (this.isUploading) return show(NO_UPLOAD.busy);
+        this.isUploading = true;
+        app.notices.hide("upload");
+        try {
+            const names = files.length === 1 ? files[0]?.path : `${files.length} files`;
+            const scene = await uploadScene(server, files, (sent, total) => {
+                // The server reads the files when it has all of them.
+                if (sent === total) app.cover.showProgress(`Opening ${names}`, 0, 0);
+                else app.cover.showProgress(`Uploading ${names}, ${format.bytes(total)}`, sent, total);
+            });
+            await this.select(`open:${scene}`);
+        } catch (error) {
+            const text = error instanceof Error ? error.message : String(error);
+            app.notices.show("upload", `The files could not be opened: ${text}`, { severity: "bad", duration: 0 });
+            // Shows the previous scene or the choice of scenes again.
+            if (app.model) app.cover.hide();
+            this.offered = "";
+            if (!app.model) this.switchScene();
+        } finally {
+            this.isUploading = false;
+        }
     }
 
     /** Opens "source:SOURCE" or shows "open:NAME". */

@@ -1,4 +1,4 @@
-/** Plays recordings without a server: from the page itself, or from a file that the user drops onto it. */
+/** Plays recordings without a server: from the page itself, or from a file. */
 
 import type { App } from "./app";
 import { Playback } from "./source/playback";
@@ -9,19 +9,12 @@ export class RecordingPlayer {
     private timeline: Timeline | null = null;
     private playback: Playback | null = null;
 
-    /** @param onOpen Called before a dropped file is shown. */
-    constructor(
-        private readonly app: App,
-        onOpen: () => void,
-    ) {
-        window.addEventListener("dragover", (event) => event.preventDefault());
-        window.addEventListener("drop", (event) => {
-            event.preventDefault();
-            const file = event.dataTransfer?.files[0];
-            if (!file) return;
-            onOpen();
-            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes)));
-        });
+    constructor(private readonly app: App) {}
+
+    /** Plays a file. */
+    async openFile(name: string, file: Blob): Promise<void> {
+        const bytes = new Uint8Array(await file.arrayBuffer());
+        this.open(name, bytes);
     }
 
     /** Plays the recording that the page contains. False if it contains none. */

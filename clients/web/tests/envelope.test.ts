@@ -40,6 +40,27 @@ test("start has the timeout and the path", () => {
     assert.throws(() => decodeCredit(new Uint8Array(3)), /expected 4 bytes, got 3/);
 });
 
+test("a sender waits until its messages have credit, or until the call ends", async () => {
+    const { call } = recordingCall();
+    assert.equal(await call.drained(), true);
+    const send = () => {
+        call.send(new Uint8Array(CLIENT_CREDIT));
+        call.send(new Uint8Array(1));
+    };
+    send();
+    const drained = call.drained();
+    let isDrained = false;
+    void drained.then(() => (isDrained = true));
+    await new Promise((done) => setTimeout(done, 1));
+    assert.equal(isDrained, false);
+    call.onCredit(1);
+    assert.equal(await drained, true);
+    send();
+    const ended = call.drained();
+    call.finish(null);
+    assert.equal(await ended, false);
+});
+
 test("messages wait for credit, and END follows them", () => {
     const { call, sent } = recordingCall();
     call.send(new Uint8Array(CLIENT_CREDIT - 1));

@@ -11,7 +11,13 @@ import {
     type PickHead,
     type StreamFramesResponse,
 } from "../proto/modalcast/v1/frames_pb";
-import { type ListScenesResponse, type SceneInfo, SceneService } from "../proto/modalcast/v1/scenes_pb";
+import {
+    type ListScenesResponse,
+    type SceneInfo,
+    SceneService,
+    type UploadSceneRequestSchema,
+    type UploadSceneResponse,
+} from "../proto/modalcast/v1/scenes_pb";
 import { type GetServerInfoResponse, ServerService } from "../proto/modalcast/v1/server_pb";
 import { StateService, type StreamStatesResponse } from "../proto/modalcast/v1/states_pb";
 import { type DriveSceneRequestSchema, type DriveSceneResponse, StepService } from "../proto/modalcast/v1/steps_pb";
@@ -30,6 +36,9 @@ const HASHES_PER_REQUEST = 4096;
 
 /** Stage times arrive with every so many states: about twice per second at 60 steps per second. */
 const STAGES_EVERY = 30;
+
+/** Bytes of a part of an uploaded file. */
+const UPLOAD_PART = 256 << 10;
 
 /** Flow-control window of a picture stream in bytes. It admits one frame, so that a slow browser gets the newest. */
 const PICTURE_WINDOW = 1;
@@ -60,6 +69,14 @@ export interface PickResult {
     hits: Hit[];
 }
 
+/** A file to upload, and its path in the folder of the scene. */
+export interface UploadedFile {
+    path: string;
+    file: Blob;
+}
+
+type UploadStream = DuplexStream<MessageInitShape<typeof UploadSceneRequestSchema>, UploadSceneResponse>;
+
 export type DriveStream = DuplexStream<MessageInitShape<typeof DriveSceneRequestSchema>, DriveSceneResponse>;
 
 export class Server {
@@ -81,6 +98,33 @@ export class Server {
         const { scene } = await this.channel.unary(SceneService.method.openScene, { source, scene: name });
         if (!scene) throw new Error("OpenScene: expected a scene, got none");
         return scene;
+    }
+
+    /**
+     * Uploads files, and opens them as a scene.
+     *
+     * @param entry The path to open; empty: the folder of all files.
+     * @param progress Called with the bytes of each part that was sent.
+     */
+    async uploadScene(
+        scene: string,
+        entry: string,
+        files: readonly UploadedFile[],
+        progress: (bytes: number) => void,
+    ): Promise<SceneInfo> {
+        const stream = this.channel.duplexStream(SceneService.method.uploadScene);
+        try {
+            const totalBytes = BigInt(files.reduce((sum, { file }) => sum + file.size, 0));
+            stream.send({ part: { case: "header", value: { scene, entry, files: files.length, totalBytes } } });
+            for (const file of files) if (!(await sendFile(stream, file, progress))) break;
+            stream.end();
+            let info: SceneInfo | undefined;
+            for await (const response of stream) info = response.scene;
+            if (!info) throw new Error("UploadScene: expected a scene, got none");
+            return info;
+        } finally {
+            stream.cancel();
+        }
     }
 
     async describe(scene: string): Promise<SceneDescription> {
@@ -199,4 +243,22 @@ export class Server {
         }
         return received;
     }
+}
+
+/** Sends a file in parts. False if the server has ended the call before. */
+async function sendFile(
+    stream: UploadStream,
+    { path, file }: UploadedFile,
+    progress: (bytes: number) => void,
+): Promise<boolean> {
+    const content = new Uint8Array(await file.arrayBuffer());
+    const sha256 = new Uint8Array(await crypto.subtle.digest("SHA-256", content));
+    stream.send({ part: { case: "file", value: { path, bytes: BigInt(content.length), sha256 } } });
+    for (let offset = 0; offset < content.length; offset += UPLOAD_PART) {
+        const part = content.subarray(offset, offset + UPLOAD_PART);
+        stream.send({ part: { case: "chunk", value: part } });
+        if (!(await stream.drained())) return false;
+        progress(part.length);
+    }
+    return true;
 }

@@ -1,6 +1,6 @@
 /** The page in front of the view: loading, choice of a scene, and errors that end the view. */
 
-import { byId, h } from "./dom";
+import { byId, h, setText } from "./dom";
 
 export interface Choice {
     label: string;
@@ -11,6 +11,7 @@ export interface Choice {
 export class Cover {
     private readonly element = byId("cover");
     private progress: HTMLProgressElement | null = null;
+    private readonly progressTitle = h("h1");
 
     hide(): void {
         this.element.hidden = true;
@@ -41,11 +42,14 @@ export class Cover {
     /** Shows the progress of a load. `total` 0: unknown. */
     showProgress(title: string, received: number, total: number): void {
         if (!this.progress || this.element.hidden) {
-            const progress = h("progress", { aria: { label: title } });
-            this.set(h("h1", { textContent: title }), progress);
+            const progress = h("progress");
+            this.set(this.progressTitle, progress);
             this.progress = progress;
         }
-        if (total > 0) {
+        setText(this.progressTitle, title);
+        this.progress.setAttribute("aria-label", title);
+        if (total === 0) this.progress.removeAttribute("value");
+        else {
             this.progress.max = total;
             this.progress.value = received;
         }

@@ -56,3 +56,10 @@ function rounded(value: number): string {
 export function count(value: number | bigint): string {
     return value.toLocaleString("en-US");
 }
+
+/** Where an open scene comes from, as a sentence. `source`: see SceneInfo.source. */
+export function sceneOrigin(source: string): string {
+    const [, isUpload, file] = /^(uploaded)(?:: (.*))?$/.exec(source) ?? [];
+    if (!isUpload) return source ? `Open now. The server has read it from ${source}.` : "Open now.";
+    return file ? `Open now. It was sent to the server as ${file}.` : "Open now. It was sent to the server.";
+}

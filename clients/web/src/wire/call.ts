@@ -16,6 +16,7 @@ export class Call {
     private clientCredit = CLIENT_CREDIT;
     private readonly waiting: Uint8Array[] = [];
     private endsAfterWaiting = false;
+    private wakeSender: (() => void) | null = null;
     private unreturned: number;
     private readonly creditBatch: number;
     private inProcess = 0;
@@ -44,6 +45,16 @@ export class Call {
     /** Number of messages that wait for credit. */
     get backlog(): number {
         return this.waiting.length;
+    }
+
+    /** Resolves when no message waits for credit: true if the call still takes messages, false if it has ended. */
+    async drained(): Promise<boolean> {
+        while (!this.hasEnded && this.waiting.length > 0) {
+            await new Promise<void>((resolve) => {
+                this.wakeSender = resolve;
+            });
+        }
+        return !this.hasEnded;
     }
 
     /** No more messages follow. */
@@ -92,6 +103,7 @@ export class Call {
         this.waiting.length = 0;
         this.release();
         this.notify();
+        this.wakeSender?.();
     }
 
     private notify(): void {
@@ -106,6 +118,7 @@ export class Call {
             this.clientCredit -= message.length;
             this.sendEnvelope(ClientKind.message, message);
         }
+        if (this.waiting.length === 0) this.wakeSender?.();
         if (this.endsAfterWaiting && this.waiting.length === 0) {
             this.endsAfterWaiting = false;
             this.sendEnvelope(ClientKind.end);

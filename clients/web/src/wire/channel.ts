@@ -4,6 +4,7 @@ import {
     create,
     type DescMessage,
     type DescMethodBiDiStreaming,
+    type DescMethodClientStreaming,
     type DescMethodServerStreaming,
     type DescMethodUnary,
     fromBinary,
@@ -29,11 +30,13 @@ export interface ReplyStream<T> extends AsyncIterable<T> {
     cancel(): void;
 }
 
-/** Both directions of a bidirectional stream. */
+/** Both directions of a stream of the client. */
 export interface DuplexStream<I, O> extends ReplyStream<O> {
     send(message: I): void;
     /** Number of messages that wait for flow control. */
     readonly backlog: number;
+    /** Resolves when no message waits: true if the call still takes messages, false if it has ended. */
+    drained(): Promise<boolean>;
     end(): void;
 }
 
@@ -96,7 +99,7 @@ export class Channel {
     }
 
     duplexStream<I extends DescMessage, O extends DescMessage>(
-        method: DescMethodBiDiStreaming<I, O>,
+        method: DescMethodBiDiStreaming<I, O> | DescMethodClientStreaming<I, O>,
         options: CallOptions = {},
     ): DuplexStream<MessageInitShape<I>, MessageShape<O>> {
         const call = this.start(method, options);
@@ -107,6 +110,7 @@ export class Channel {
             get backlog() {
                 return call.backlog;
             },
+            drained: () => call.drained(),
             end: () => call.end(),
         };
     }

@@ -46,8 +46,14 @@ export class ServerProcess {
     private port = 0;
     private connected: Server | null = null;
 
-    /** @param scenes Folder of the scene repository; empty: built-in scenes only. */
-    constructor(private readonly scenes = "") {}
+    /**
+     * @param scenes Folder of the scene repository; empty: built-in scenes only.
+     * @param options More options of `modalcast serve`.
+     */
+    constructor(
+        private readonly scenes = "",
+        private readonly options: readonly string[] = [],
+    ) {}
 
     /** Starts the server, the second time at the same port. */
     async start(): Promise<void> {
@@ -64,6 +70,7 @@ export class ServerProcess {
             "--backend",
             "cpu",
             ...scenes,
+            ...this.options,
         ];
         this.process = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
         this.port = Number(new URL(await printedUrl(this.process, "viewer at")).port);
@@ -193,6 +200,19 @@ export async function takeScreenshot(page: Page, name: string): Promise<void> {
     if (!SCREENSHOTS) return;
     mkdirSync(SCREENSHOTS, { recursive: true });
     await page.screenshot({ path: join(SCREENSHOTS, `${name}.png`) });
+}
+
+/** Drops files onto the page. */
+export async function dropFiles(page: Page, files: Record<string, Buffer | string>): Promise<void> {
+    const entries = Object.entries(files).map(([name, content]) => [name, Buffer.from(content).toString("base64")]);
+    await page.evaluate((list) => {
+        const dataTransfer = new DataTransfer();
+        for (const [name = "", base64 = ""] of list) {
+            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
+            dataTransfer.items.add(new File([content], name));
+        }
+        window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+    }, entries);
 }
 
 /** Waits until the page shows a scene. */

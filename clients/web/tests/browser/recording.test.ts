@@ -12,6 +12,7 @@ import { type Recording, readRecording } from "../../src/source/recording";
 import {
     changedValues,
     committedPage,
+    dropFiles,
     end,
     launchBrowser,
     openPage,
@@ -181,9 +182,13 @@ test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, a
     const { page, errors } = await openPage(browser, pathToFileURL(viewerPage).href, WIDTH, HEIGHT);
     // Control: without a recording there is nothing to play.
     await page.getByRole("heading", { name: "No recording" }).waitFor();
-    await drop(page, "cut.mcap", readFileSync(file).subarray(0, 3000));
+    await dropFiles(page, { "cut.mcap": readFileSync(file).subarray(0, 3000) });
     await page.getByRole("heading", { name: "The recording cannot be played" }).waitFor();
-    await drop(page, "tree.mcap", readFileSync(file));
+    await dropFiles(page, { "part.stl": "solid part" });
+    const noServer = page.locator(".notice", { hasText: "This page has no server that could read a model." });
+    // The message must not cover the view that is clicked below.
+    await noServer.getByRole("button", { name: "Close this message" }).click();
+    await dropFiles(page, { "tree.mcap": readFileSync(file) });
     await checkPlayback(page);
     // A pull says that a recording does not react.
     const notice = page.locator(".notice", { hasText: "does not react to forces" }).waitFor();
@@ -195,19 +200,6 @@ test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, a
     assert.deepEqual(errors, []);
     await page.close();
 });
-
-/** Drops a file onto the page. */
-async function drop(page: Page, name: string, bytes: Buffer): Promise<void> {
-    await page.evaluate(
-        ([fileName, base64]) => {
-            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
-            const dataTransfer = new DataTransfer();
-            dataTransfer.items.add(new File([content], fileName));
-            window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
-        },
-        [name, bytes.toString("base64")] as const,
-    );
-}
 
 test("a page with a damaged recording says so", { timeout: LIMIT_MS }, async () => {
     const damaged = readFileSync(exportedPage, "utf8");

@@ -1,0 +1,69 @@
+/** Uploads dropped files to the server as one scene. */
+
+import type { Limits } from "../proto/modalcast/v1/server_pb";
+import type { Server, UploadedFile } from "../source/server";
+import * as format from "../ui/format";
+
+/** Extensions of models, for the name of a scene of several files. The server decides which file it opens. */
+const MODEL = /\.(glb|gltf|obj|ply|stl|npz)$/i;
+const MAX_NAME_LETTERS = 64;
+/** Largest number of files of an upload, see UploadHeader. */
+const MAX_FILES = 4096;
+
+/** Why the files cannot be uploaded; empty if they can. */
+export function uploadProblem(files: readonly UploadedFile[], limits: Pick<Limits, "uploadBytes"> | undefined): string {
+    if (files.length === 0) return "There are no files in this folder.";
+    if (files.length > MAX_FILES)
+        return `The server accepts at most ${format.count(MAX_FILES)} files for a scene, and these are ${format.count(files.length)}.`;
+    const total = files.reduce((sum, { file }) => sum + file.size, 0);
+    if (limits && BigInt(total) > limits.uploadBytes) {
+        const limit = format.bytes(Number(limits.uploadBytes));
+        return `The server accepts at most ${limit} for a scene, and these files have ${format.bytes(total)}.`;
+    }
+    if (!globalThis.crypto?.subtle)
+        return "The browser cannot compute the checksums of an upload on this page, because it was loaded from another machine without encryption. Open it through `ssh -L`, so that its address begins with localhost.";
+    return "";
+}
+
+/** The path to open: the only file, or the whole folder, in which the server finds scene.toml or the model. */
+export function entryOf(files: readonly UploadedFile[]): string {
+    return files.length === 1 ? (files[0]?.path ?? "") : "";
+}
+
+/** A name for a scene of the files that no other scene has. */
+export function sceneName(files: readonly UploadedFile[], used: ReadonlySet<string>): string {
+    const { path } = files.find((candidate) => MODEL.test(candidate.path)) ?? files[0] ?? { path: "" };
+    const stem = path.replace(/^.*\//, "").replace(/\.[^.]*$/, "");
+    const valid = stem.replace(/[^A-Za-z0-9._-]+/g, "-").replace(/^[.-]+/, "") || "model";
+    for (let number = 1; ; number++) {
+        const suffix = number === 1 ? "" : `-${number}`;
+        const name = valid.slice(0, MAX_NAME_LETTERS - suffix.length) + suffix;
+        if (!used.has(name)) return name;
+    }
+}
+
+/**
+ * Uploads the files, and opens them as a scene. Returns its name.
+ *
+ * @param progress Called with the sum of the bytes that were sent, and the bytes of all files.
+ * @throws Error with a sentence for the user.
+ */
+export async function uploadScene(
+    server: Server,
+    files: readonly UploadedFile[],
+    progress: (sent: number, total: number) => void,
+): Promise<string> {
+    const { limits } = await server.getInfo();
+    const problem = uploadProblem(files, limits);
+    if (problem) throw new Error(problem);
+    const { scenes, opening, failed } = await server.listScenes();
+    const used = [...scenes.map(({ scene }) => scene), ...opening, ...failed.map(({ scene }) => scene)];
+    const total = files.reduce((sum, { file }) => sum + file.size, 0);
+    let sent = 0;
+    progress(0, total);
+    const info = await server.uploadScene(sceneName(files, new Set(used)), entryOf(files), files, (bytes) => {
+        sent += bytes;
+        progress(sent, total);
+    });
+    return info.scene;
+}
