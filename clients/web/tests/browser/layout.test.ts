@@ -106,6 +106,28 @@ test("the buttons of a live scene fit into the page of a phone", { timeout: LIMI
     await page.close();
 });
 
+test("legend, scale bar and buttons do not cover each other", { timeout: LIMIT_MS }, async () => {
+    for (const [name, [width, height]] of [
+        ["desktop", DESKTOP],
+        ["phone", PHONE],
+    ] as const) {
+        const { page } = await setup.open(width, height);
+        await page.keyboard.press("m");
+        await page.locator("#legend").waitFor();
+        await takeScreenshot(page, `layout-legend-${name}`);
+        const selectors = ["#legend", "#scale-bar", "#timeline", "#tools", "#axes", "#bar"];
+        const boxes = await Promise.all(selectors.map((selector) => elementBox(page, selector)));
+        boxes.forEach((a, index) => {
+            for (const [other, b] of boxes.entries()) {
+                if (other <= index) continue;
+                const isApart = a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top;
+                assert.ok(isApart, `${name}: ${selectors[index]} covers ${selectors[other]}`);
+            }
+        });
+        await page.close();
+    }
+});
+
 test("a view that the user has turned stays when the page changes its size", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await setup.open(...PHONE);
     const eye = () => page.evaluate(() => modalcastViewer.viewport.camera.eye);
