@@ -1,7 +1,8 @@
 /** Shows scenes of a server, and connects again after the connection has broken. */
 
 import type { App } from "./app";
-import { uploadScene } from "./control/scene_upload";
+import { inMillimeters, mayBeInMillimeters, uploadScene } from "./control/scene_upload";
+import type { SceneInfo } from "./proto/modalcast/v1/scenes_pb";
 import { Feature } from "./proto/modalcast/v1/server_pb";
 import { contentBytes, parseArrays, type SceneArrays } from "./scene/arrays";
 import type { SceneDescription } from "./scene/description";
@@ -224,8 +225,12 @@ export class LiveViewer {
         app.cover.showChoices(title, `${problem}${CHOICE}`, choices);
     }
 
-    /** Uploads files that the user has dropped onto the page, and shows their scene. */
-    async upload(files: readonly UploadedFile[]): Promise<void> {
+    /**
+     * Uploads files that the user has dropped onto the page, and shows their scene.
+     *
+     * @param replaced Name of a scene that is deleted afterwards; empty: none.
+     */
+    async upload(files: readonly UploadedFile[], replaced = ""): Promise<void> {
         const { app, server } = this;
         const show = (text: string) => app.notices.show("upload", text, { severity: "warn", duration: NOTICE_MS });
         if (this.isStopped) return show(this.isConnected ? NO_UPLOAD.left : NO_UPLOAD.noServer);
@@ -235,12 +240,14 @@ export class LiveViewer {
         app.notices.hide("upload");
         try {
             const names = files.length === 1 ? files[0]?.path : `${files.length} files`;
-            const scene = await uploadScene(server, files, (sent, total) => {
+            const info = await uploadScene(server, files, (sent, total) => {
                 // The server reads the files when it has all of them.
                 if (sent === total) app.cover.showProgress(`Opening ${names}`, 0, 0);
                 else app.cover.showProgress(`Uploading ${names}, ${format.bytes(total)}`, sent, total);
             });
-            await this.select(`open:${scene}`);
+            await this.select(`open:${info.scene}`);
+            if (replaced) await server.deleteScene(replaced);
+            this.offerMillimeters(files, info);
         } catch (error) {
             const text = error instanceof Error ? error.message : String(error);
             app.notices.show("upload", `The files could not be opened: ${text}`, { severity: "bad", duration: 0 });
@@ -251,6 +258,15 @@ export class LiveViewer {
         } finally {
             this.isUploading = false;
         }
+    }
+
+    private offerMillimeters(files: readonly UploadedFile[], info: SceneInfo): void {
+        const millimeters = mayBeInMillimeters(info) ? inMillimeters(files) : null;
+        if (!millimeters) return;
+        const text = "The file has no unit, so its lengths were read in meters, which makes the model very large.";
+        const run = () => void this.upload(millimeters, info.scene);
+        const action = { label: "Read it in millimeters", run };
+        this.app.notices.show("upload", text, { severity: "warn", duration: 0, action });
     }
 
     /** Opens "source:SOURCE" or shows "open:NAME". */

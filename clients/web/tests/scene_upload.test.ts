@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { entryOf, sceneName, uploadProblem } from "../src/control/scene_upload";
+import { entryOf, inMillimeters, sceneName, uploadProblem } from "../src/control/scene_upload";
 import type { UploadedFile } from "../src/source/server";
 
 function files(...paths: string[]): UploadedFile[] {
@@ -38,4 +38,16 @@ test("files beyond the limits of the server are not sent", () => {
     );
     assert.match(uploadProblem([], undefined), /no files/);
     assert.match(uploadProblem(Array(4097).fill(files("a")[0]), undefined), /at most 4,096 files/);
+});
+
+test("a scene.toml sets the unit of the only model", async () => {
+    const millimeters = inMillimeters(files("wood.png", 'parts/5" pipe.obj'));
+    assert.equal(entryOf(millimeters ?? []), "");
+    assert.deepEqual(
+        millimeters?.map(({ path }) => path),
+        ["wood.png", 'parts/5" pipe.obj', "scene.toml"],
+    );
+    assert.equal(await millimeters?.at(-1)?.file.text(), 'model = "parts/5\\" pipe.obj"\nunit = "mm"\n');
+    assert.equal(inMillimeters(files("a.stl", "scene.toml")), null);
+    assert.equal(inMillimeters(files("a.stl", "b.stl")), null);
 });

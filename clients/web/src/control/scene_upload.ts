@@ -1,5 +1,6 @@
 /** Uploads dropped files to the server as one scene. */
 
+import type { SceneInfo } from "../proto/modalcast/v1/scenes_pb";
 import type { Limits } from "../proto/modalcast/v1/server_pb";
 import type { Server, UploadedFile } from "../source/server";
 import * as format from "../ui/format";
@@ -30,6 +31,22 @@ export function entryOf(files: readonly UploadedFile[]): string {
     return files.length === 1 ? (files[0]?.path ?? "") : "";
 }
 
+/**
+ * The files with a scene.toml that sets the unit of their model to millimeters; null if they have one, or not one model.
+ */
+export function inMillimeters(files: readonly UploadedFile[]): UploadedFile[] | null {
+    const [model, ...others] = files.filter(({ path }) => MODEL.test(path));
+    if (!model || others.length > 0 || files.some(({ path }) => /(^|\/)scene\.toml$/.test(path))) return null;
+    // A JSON string is a string of TOML.
+    const text = `model = ${JSON.stringify(model.path)}\nunit = "mm"\n`;
+    return [...files, { path: "scene.toml", file: new Blob([text]) }];
+}
+
+/** Whether the server presumes that the model is in millimeters, because its file has no unit and is very large in meters. */
+export function mayBeInMillimeters({ remarks }: Pick<SceneInfo, "remarks">): boolean {
+    return remarks.some((remark) => remark.includes("if its file is in millimeters"));
+}
+
 /** A name for a scene of the files that no other scene has. */
 export function sceneName(files: readonly UploadedFile[], used: ReadonlySet<string>): string {
     const { path } = files.find((candidate) => MODEL.test(candidate.path)) ?? files[0] ?? { path: "" };
@@ -43,7 +60,7 @@ export function sceneName(files: readonly UploadedFile[], used: ReadonlySet<stri
 }
 
 /**
- * Uploads the files, and opens them as a scene. Returns its name.
+ * Uploads the files, and opens them as a scene.
  *
  * @param progress Called with the sum of the bytes that were sent, and the bytes of all files.
  * @throws Error with a sentence for the user.
@@ -52,7 +69,7 @@ export async function uploadScene(
     server: Server,
     files: readonly UploadedFile[],
     progress: (sent: number, total: number) => void,
-): Promise<string> {
+): Promise<SceneInfo> {
     const { limits } = await server.getInfo();
     const problem = uploadProblem(files, limits);
     if (problem) throw new Error(problem);
@@ -61,9 +78,8 @@ export async function uploadScene(
     const total = files.reduce((sum, { file }) => sum + file.size, 0);
     let sent = 0;
     progress(0, total);
-    const info = await server.uploadScene(sceneName(files, new Set(used)), entryOf(files), files, (bytes) => {
+    return server.uploadScene(sceneName(files, new Set(used)), entryOf(files), files, (bytes) => {
         sent += bytes;
         progress(sent, total);
     });
-    return info.scene;
 }

@@ -127,6 +127,10 @@ export class Server {
         }
     }
 
+    async deleteScene(scene: string): Promise<void> {
+        await this.channel.unary(SceneService.method.deleteScene, { scene });
+    }
+
     async describe(scene: string): Promise<SceneDescription> {
         const collector = new DescriptionCollector();
         const stream = this.channel.serverStream(SceneService.method.describeScene, { scene, hashes: true });

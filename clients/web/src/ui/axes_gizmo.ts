@@ -9,6 +9,8 @@ const SVG = "http://www.w3.org/2000/svg";
 const LENGTH = 34;
 const RADIUS = 9;
 const SMALL_RADIUS = 6;
+/** Radius that a click or a finger hits. */
+const HIT_RADIUS = 13;
 
 interface AxisEnd {
     direction: Vec3;
@@ -61,7 +63,8 @@ export class AxesGizmo {
         const line = create<SVGLineElement>("line", {});
         const title = create("title", {});
         title.textContent = label;
-        element.append(title, line, create("circle", { r: sign > 0 ? RADIUS : SMALL_RADIUS }));
+        const circle = create("circle", { r: sign > 0 ? RADIUS : SMALL_RADIUS });
+        element.append(title, line, create("circle", { r: HIT_RADIUS, class: "hit" }), circle);
         if (sign > 0) {
             const text = create("text", {});
             text.textContent = name;

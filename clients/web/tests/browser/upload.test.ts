@@ -86,6 +86,30 @@ test("files that are dropped together form one scene", { timeout: LIMIT_MS }, as
     await page.close();
 });
 
+test("a model without a unit can be read in millimeters", { timeout: LIMIT_MS }, async () => {
+    const { page, errors } = await openPage(browser, server.pageUrl(""), 900, 600);
+    await page.locator("#cover h1").waitFor();
+    const size = () =>
+        page.evaluate(() => {
+            const { bounds = [], unit = Number.NaN } = modalcastViewer.model?.scene.info ?? {};
+            return ((bounds[3] ?? 0) - (bounds[0] ?? 0)) * unit;
+        });
+    await dropFiles(page, { "plate.obj": "v 0 0 0\nv 80 0 0\nv 0 40 0\nf 1 2 3\n" });
+    await waitForSceneNamed(page, "plate");
+    assert.equal(await size(), 80);
+    const notice = page.locator(".notice", { hasText: "The file has no unit" });
+    await takeScreenshot(page, "upload-unit");
+    await notice.getByRole("button", { name: "Read it in millimeters" }).click();
+    await waitForSceneNamed(page, "plate-2");
+    assert.ok(Math.abs((await size()) - 0.08) < 1e-9);
+    await notice.waitFor({ state: "hidden" });
+    const { scenes } = await (await server.client()).listScenes();
+    const names = scenes.map(({ scene }) => scene);
+    assert.ok(names.includes("plate-2") && !names.includes("plate"), names.join());
+    assert.deepEqual(errors, []);
+    await page.close();
+});
+
 test("a file that the server cannot read leaves the scene in view", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await openPage(browser, server.pageUrl(""), 900, 600);
     await page.locator("#cover h1").waitFor();

@@ -94,7 +94,7 @@ test("a click on an axis looks along it", { timeout: LIMIT_MS }, async () => {
         });
     await page.waitForFunction(() => modalcastViewer.viewport.camera.hasMoved);
     const before = await distance();
-    await page.locator("#axes .x.positive circle").click();
+    await page.locator("#axes .x.positive .hit").click();
     assert.ok(((await toCamera(page))[0] ?? 0) > 0.999);
     assert.ok(Math.abs((await distance()) / before - 1) < 1e-6);
     await takeScreenshot(page, "axes-from-x");
