@@ -69,7 +69,7 @@ export class App implements CommandHandlers {
         });
         this.remarks = new RemarksSection(this.panel, this.notices);
         this.panel.add("View", this.view.element, true);
-        this.panel.add("Coordinates", this.coordinates.element, true);
+        this.panel.add("Modes", this.coordinates.element, true);
         this.panel.add("Domains", this.domains.element, false);
         this.status = new StatusPanels(this.panel, this.settings, this.viewport);
         this.toolbar = createToolbar(this);
@@ -136,10 +136,7 @@ export class App implements CommandHandlers {
         this.remarks.set(scene.info.remarks);
         this.frameOnce(scene);
         this.connectSession(session);
-        this.coordinates.setScene(
-            model,
-            (domain) => renderer?.deformer.packed[scene.domains[domain]?.shape ?? -1]?.norms ?? null,
-        );
+        this.coordinates.setScene(model, session.deflections);
         this.forceLines.setSession(session);
         this.cover.hide();
         document.title = `${scene.info.scene} - modalcast`;

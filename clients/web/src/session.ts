@@ -6,6 +6,7 @@ import { PullTool } from "./control/pull";
 import { SceneRenderer } from "./render/scene_renderer";
 import type { Viewport } from "./render/viewport";
 import { norm, type Vec3 } from "./scene/affine";
+import { Deflections } from "./scene/deflection";
 import { at } from "./scene/numbers";
 import type { SceneModel } from "./scene/scene_model";
 import type { Server } from "./source/server";
@@ -33,6 +34,8 @@ export class SceneSession {
     readonly pictures: PictureView | null;
     readonly pull: PullTool | null;
     readonly driver: Driver | null;
+    /** Null without the arrays of the scene. */
+    readonly deflections: Deflections | null;
     private hasFirstState = false;
     private lastForeignStep = -Infinity;
 
@@ -45,6 +48,7 @@ export class SceneSession {
     ) {
         const { scene, arrays } = model;
         const { server, features } = source;
+        this.deflections = arrays && new Deflections(model, arrays);
         this.renderer =
             arrays && viewport.gl ? new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware) : null;
         this.pictures = server && features.pictures ? new PictureView(server, scene.info.scene, canvas) : null;

@@ -90,6 +90,17 @@ export function rankOf(scene: SceneDescription, domain: DomainDescription): numb
     return scene.shapes[domain.shape]?.rank ?? 0;
 }
 
+/** Squared angular frequencies of a domain's modes in (rad/s)^2; empty if they are unknown. */
+export function eigenvaluesOf(scene: SceneDescription, domain: number): readonly number[] {
+    const description = scene.domains[domain];
+    return description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? -1]?.eigenvalues ?? [];
+}
+
+/** Frequency of a mode in hertz; 0 if it is unknown, or if the mode has no stiffness. */
+export function hertzOf(scene: SceneDescription, domain: number, mode: number): number {
+    return Math.sqrt(Math.max(0, eigenvaluesOf(scene, domain)[mode] ?? 0)) / (2 * Math.PI);
+}
+
 /** Bytes of U of all shapes in f32. */
 export function modeBytes(scene: SceneDescription): number {
     return scene.shapes.reduce((sum, shape) => sum + 12 * shape.vertices * shape.rank, 0);

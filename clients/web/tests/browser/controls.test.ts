@@ -34,7 +34,7 @@ function shownQ(page: Page): Promise<number> {
 
 test("sliders and animated modes drive a scene that nobody else drives", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
-    const slider = page.getByRole("slider", { name: "Coordinate 1", exact: true });
+    const slider = page.getByRole("slider", { name: "Mode 1", exact: true });
     await slider.waitFor();
     await slider.focus();
     for (let press = 0; press < 10; press++) await page.keyboard.press("ArrowRight");
