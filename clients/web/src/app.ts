@@ -51,7 +51,7 @@ export class App implements CommandHandlers {
     private readonly domains = new DomainSection();
     private readonly forceLines = new ForceLines();
     private readonly pullGesture = new PullGesture(this.stage);
-    private session: SceneSession | null = null;
+    session: SceneSession | null = null;
     /** The recording that is shown; null for a server. */
     playback: Playback | null = null;
     private isPaused = false;
@@ -214,11 +214,7 @@ export class App implements CommandHandlers {
 
     nextColor = (): void => {
         if (!this.model || this.model.layout.coordinates === 0) return;
-        const { settings } = this;
-        this.change(() => {
-            settings.color = settings.color.kind === "shaded" ? { kind: "displacement" } : { kind: "shaded" };
-            this.view.showColor();
-        });
+        this.change(() => this.view.nextColor());
     };
 
     toggleEdges = (): void => this.change(() => (this.settings.edges = !this.settings.edges));
@@ -271,6 +267,14 @@ export class App implements CommandHandlers {
         // A step that changes nothing has no bytes.
         if (model.lastStateBytes === 0) return;
         if (!this.settings.pictures) renderer?.update(model.state);
+        this.fitColorScale(session);
+        this.viewport.invalidate();
+    }
+
+    private fitColorScale({ colorScale, renderer, pictures }: SceneSession): void {
+        if (!colorScale.update(performance.now())) return;
+        renderer?.setColorScale(colorScale.end);
+        if (this.settings.pictures) pictures?.start(this.pictureOptions());
         this.viewport.invalidate();
     }
 
@@ -291,6 +295,8 @@ export class App implements CommandHandlers {
             session.renderer.setOptions(settings);
             session.renderer.update(session.model.state);
         }
+        session?.colorScale.select(settings.color, performance.now());
+        session?.renderer?.setColorScale(session.colorScale.end);
         if (settings.pictures) session?.pictures?.start(this.pictureOptions());
         else session?.pictures?.stop();
         this.toolbar.setPressed("pictures", settings.pictures);
@@ -308,7 +314,7 @@ export class App implements CommandHandlers {
             camera: viewport.camera.toMessage(),
             output: outputs[settings.color.kind],
             mode: settings.color.kind === "mode" ? settings.color.mode : 0,
-            largest: this.renderer?.colorScale ?? 0,
+            largest: this.session?.colorScale.end ?? 0,
             edges: settings.edges,
         };
     }
@@ -350,6 +356,7 @@ export class App implements CommandHandlers {
         const driven = isDriven ? "A physics process drives this scene." : this.driveHint;
         this.coordinates.setCanDrive(source.features.drive && !isDriven, source.features.drive ? driven : "");
         this.coordinates.update();
+        if (!this.isPaused) this.fitColorScale(session);
         if (driver && !driver.isAnimating) this.coordinates.setAnimated(false);
         this.updateTimeScale(isDriven);
         this.status.update(session);

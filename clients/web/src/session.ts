@@ -3,6 +3,7 @@
 import { Driver } from "./control/driver";
 import { PictureView } from "./control/picture_view";
 import { PullTool } from "./control/pull";
+import { ColorScale } from "./render/color_scale";
 import { SceneRenderer } from "./render/scene_renderer";
 import type { Viewport } from "./render/viewport";
 import { norm, type Vec3 } from "./scene/affine";
@@ -36,6 +37,7 @@ export class SceneSession {
     readonly driver: Driver | null;
     /** Null without the arrays of the scene. */
     readonly deflections: Deflections | null;
+    readonly colorScale: ColorScale;
     private hasFirstState = false;
     private lastForeignStep = -Infinity;
 
@@ -49,6 +51,7 @@ export class SceneSession {
         const { scene, arrays } = model;
         const { server, features } = source;
         this.deflections = arrays && new Deflections(model, arrays);
+        this.colorScale = new ColorScale(this.deflections, diagonal(model) * scene.info.unit);
         this.renderer =
             arrays && viewport.gl ? new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware) : null;
         this.pictures = server && features.pictures ? new PictureView(server, scene.info.scene, canvas) : null;

@@ -1,5 +1,6 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { ColorScale } from "../src/render/color_scale";
 import type { SceneArrays, ShapeArrays } from "../src/scene/arrays";
 import { Deflections } from "../src/scene/deflection";
 import { SceneModel } from "../src/scene/scene_model";
@@ -89,4 +90,32 @@ test("a large scene is sampled, and says so", () => {
     const q = [0.7, 0.9];
     assert.ok(sampled.largest(0, q) <= exact.largest(0, q));
     assert.ok(sampled.largest(0, q) > 0.999 * exact.largest(0, q));
+});
+
+test("the color map ends at a round number above the largest deflection", () => {
+    const { model, arrays } = modelOf(bends(101));
+    const scale = new ColorScale(new Deflections(model, arrays), 0.5);
+    assert.equal(scale.end, 0, "no color map");
+    const deflection = { kind: "displacement" } as const;
+    scale.select(deflection, 0);
+    assert.equal(scale.end, 0.5, "q = (0.5, 0) deflects by 0.25 m");
+    model.state.q[0] = 3;
+    assert.equal(scale.update(20), false, "at most one evaluation in 50 ms");
+    assert.equal(scale.update(60), true);
+    assert.equal(scale.end, 2);
+    scale.select(deflection, 120);
+    assert.equal(scale.end, 2, "the same choice keeps its range");
+    for (let now = 120; now < 8000; now += 100) {
+        model.state.q[0] = 1e-3;
+        scale.update(now);
+    }
+    assert.equal(scale.end, 1e-3);
+});
+
+test("the color map of a mode ends at its largest displacement", () => {
+    const { model, arrays } = modelOf(bends(101));
+    const scale = new ColorScale(new Deflections(model, arrays), 0.5);
+    scale.select({ kind: "mode", mode: 1 }, 0);
+    assert.ok(Math.abs(scale.end - 0.5) < 1e-3, `${scale.end}`);
+    assert.equal(new ColorScale(null, 1).end, 0);
 });

@@ -78,6 +78,13 @@ export class Deflections {
         return (this.evaluatedOf(domain)?.norms[mode] ?? 0) * this.metersPerUnit(domain);
     }
 
+    /** Largest norm of a vertex's row of U for one mode in all domains, in meters per unit of q. T does not scale it. */
+    largestOfMode(mode: number): number {
+        const { domains, info } = this.model.scene;
+        const norms = domains.map(({ domain }) => this.evaluatedOf(domain)?.norms[mode] ?? 0);
+        return norms.reduce((largest, norm) => Math.max(largest, norm), 0) * info.unit;
+    }
+
     /** Size of a domain at rest in meters: the diameter of a sphere around it. */
     size(domain: number): number {
         return (this.evaluatedOf(domain)?.diameter ?? 0) * this.metersPerUnit(domain);

@@ -101,6 +101,13 @@ export function hertzOf(scene: SceneDescription, domain: number, mode: number): 
     return Math.sqrt(Math.max(0, eigenvaluesOf(scene, domain)[mode] ?? 0)) / (2 * Math.PI);
 }
 
+/** Frequency of a mode in hertz if it is the same in all domains that have the mode; otherwise 0. */
+export function commonHertz(scene: SceneDescription, mode: number): number {
+    const domains = scene.domains.filter((domain) => mode < rankOf(scene, domain));
+    const frequencies = new Set(domains.map(({ domain }) => hertzOf(scene, domain, mode)));
+    return frequencies.size === 1 ? ([...frequencies][0] ?? 0) : 0;
+}
+
 /** Bytes of U of all shapes in f32. */
 export function modeBytes(scene: SceneDescription): number {
     return scene.shapes.reduce((sum, shape) => sum + 12 * shape.vertices * shape.rank, 0);

@@ -139,8 +139,8 @@ export class CoordinateSection {
         );
         this.barRange.update(largestOfModes, performance.now());
         const end = this.canDrive ? Math.max(this.sliderEnd, largestOfModes) : this.barRange.end;
-        setText(this.ends[0], `−${format.meters(end)}`);
-        setText(this.ends[2], `+${format.meters(end)}`);
+        setText(this.ends[0], format.signedMeters(-end));
+        setText(this.ends[2], format.signedMeters(end));
         for (const row of this.rows) {
             const value = at(q, row.mode);
             row.update(value, row.metersPerQ > 0 ? end / row.metersPerQ : Math.max(1, Math.abs(value)));

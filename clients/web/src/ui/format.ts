@@ -18,6 +18,12 @@ export function meters(value: number): string {
     return size < 1e4 ? `${short(value)} m` : `${short(value / 1e3)} km`;
 }
 
+/** With a sign, unless the value is 0. */
+export function signedMeters(value: number): string {
+    if (value === 0) return meters(0);
+    return `${value < 0 ? "−" : "+"}${meters(Math.abs(value))}`;
+}
+
 export function newtons(value: number): string {
     const size = Math.abs(value);
     if (size >= 1e6) return `${short(value / 1e6)} MN`;

@@ -74,6 +74,6 @@ export class ModeRow {
     }
 
     private deflectionText(q: number): string {
-        return this.metersPerQ > 0 ? format.meters(q * this.metersPerQ) : `q = ${format.short(q)}`;
+        return this.metersPerQ > 0 ? format.signedMeters(q * this.metersPerQ) : `q = ${format.short(q)}`;
     }
 }

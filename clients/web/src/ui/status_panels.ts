@@ -4,12 +4,14 @@ import type { SceneInfo } from "../proto/modalcast/v1/scenes_pb";
 import { meshBytes } from "../render/surfaces";
 import type { Viewport } from "../render/viewport";
 import { norm, type Vec3 } from "../scene/affine";
+import { commonHertz } from "../scene/description";
 import { at } from "../scene/numbers";
 import type { SceneSession } from "../session";
 import { h, setText } from "./dom";
 import { FactsTable } from "./facts_table";
 import * as format from "./format";
 import { Legend } from "./legend";
+import { modeName } from "./mode_row";
 import type { Panel } from "./panel";
 import { RateMeter } from "./rate_meter";
 import type { Settings } from "./settings";
@@ -99,12 +101,12 @@ export class StatusPanels {
         return `at most ${format.meters(renderer.errorBound())}`;
     }
 
-    private updateLegend({ renderer }: SceneSession): void {
+    private updateLegend({ renderer, colorScale, model }: SceneSession): void {
         const { color, pictures } = this.settings;
         if (pictures || color.kind === "shaded" || !renderer) return this.legend.hide();
-        const title = color.kind === "mode" ? `Mode ${color.mode + 1}, per unit of q` : "Displacement";
-        const scale = renderer.colorScale;
-        this.legend.show(title, color.kind === "mode" ? `${format.short(scale)} m` : format.meters(scale));
+        if (color.kind === "displacement") return this.legend.show("Deflection", format.meters(colorScale.end));
+        const name = modeName(color.mode, commonHertz(model.scene, color.mode));
+        this.legend.show(`${name}: part of its largest deflection`, "100 %");
     }
 
     private updateForces({ model, pull, source }: SceneSession): void {

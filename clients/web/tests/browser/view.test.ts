@@ -95,6 +95,23 @@ function upperPixel(page: Page): Promise<[number, number]> {
     });
 }
 
+/** The color map of deflections ends at a round number that is at most 5 / 2 times the largest recent deflection. */
+async function checkColorRange(page: Page): Promise<void> {
+    await page.keyboard.press("m");
+    const legend = page.locator("#legend .ends span").nth(1);
+    await legend.filter({ hasText: / m/ }).waitFor();
+    const scale = await page.evaluate(() => {
+        const { deflections, colorScale } = modalcastViewer.session ?? {};
+        return { end: colorScale?.end ?? 0, largest: deflections?.largestOfScene() ?? 0 };
+    });
+    assert.ok(scale.end >= scale.largest && scale.end < 0.1, JSON.stringify(scale));
+    assert.match((await legend.textContent()) ?? "", /^[125]0{0,2} mm$/);
+    await page.keyboard.press("m");
+    await page.locator("#legend", { hasText: "Mode 1, 1 Hz: part of its largest deflection" }).waitFor();
+    await page.keyboard.press("m");
+    await page.locator("#legend").waitFor({ state: "hidden" });
+}
+
 function coordinates(page: Page): Promise<number[]> {
     return page.evaluate(() => [...(modalcastViewer.model?.state.q ?? [])]);
 }
@@ -136,6 +153,7 @@ test("a one-part archive with eigenvalues is pulled, moves and rings down", { ti
     }, pulled);
     let norm = Math.hypot(...pulled);
     while (norm > 0.2 * Math.hypot(...pulled)) norm = await largestNorm(page, 1200);
+    await checkColorRange(page);
     assert.equal(await page.locator(".notice").count(), 0);
     // The page learns that the physics process has ended.
     const physics = children(program)["modalcast-sim"];
