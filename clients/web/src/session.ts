@@ -55,7 +55,10 @@ export class SceneSession {
         this.renderer =
             arrays && viewport.gl ? new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware) : null;
         this.pictures = server && features.pictures ? new PictureView(server, scene.info.scene, canvas) : null;
-        this.pull = server && features.forces ? new PullTool(server, model, viewport.camera, diagonal(model)) : null;
+        this.pull =
+            server && features.forces
+                ? new PullTool(server, model, viewport.camera, diagonal(model), this.deflections)
+                : null;
         this.driver = server && features.drive ? new Driver(server, model) : null;
     }
 

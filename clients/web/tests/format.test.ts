@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { frequency, seconds, signedMeters, timeScale } from "../src/ui/format";
+import { frequency, limitedNewtons, seconds, signedMeters, timeScale } from "../src/ui/format";
 
 test("a frequency has at most four digits before its unit", () => {
     const texts = [0.25, 206.1, 1265, 12_651, 1.5e6].map(frequency);
@@ -29,4 +29,10 @@ test("times of slow motion are in milliseconds or microseconds", () => {
 test("a deflection has a sign and a unit that fits", () => {
     const texts = [0.0026, -0.00013, 0, 1.5, -2.5e-8].map(signedMeters);
     assert.deepEqual(texts, ["+2.6 mm", "−130 µm", "0 m", "+1.5 m", "−25 nm"]);
+});
+
+test("a force names its limit or says that it is unknown", () => {
+    assert.equal(limitedNewtons(120, 380.4), "120 N of at most 380 N");
+    assert.equal(limitedNewtons(120, null), "120 N, limit unknown");
+    assert.equal(limitedNewtons(0, Infinity), "0 N");
 });

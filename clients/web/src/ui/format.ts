@@ -30,6 +30,12 @@ export function newtons(value: number): string {
     return size >= 1e3 ? `${short(value / 1e3)} kN` : `${short(value)} N`;
 }
 
+/** A force in newtons and the largest one at its point; null if that is unknown, infinite if nothing bends. */
+export function limitedNewtons(value: number, limit: number | null): string {
+    if (limit === null) return `${newtons(value)}, limit unknown`;
+    return Number.isFinite(limit) ? `${newtons(value)} of at most ${newtons(limit)}` : newtons(value);
+}
+
 export function frequency(hertz: number): string {
     if (hertz >= 1e6) return `${short(hertz / 1e6)} MHz`;
     return hertz >= 1e4 ? `${short(hertz / 1e3)} kHz` : `${short(hertz)} Hz`;

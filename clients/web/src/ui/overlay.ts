@@ -5,11 +5,15 @@ import { byId } from "./dom";
 export interface OverlayLine {
     from: [number, number];
     to: [number, number];
+    /** Lines that are separated by "\n". */
     text: string;
     isOwn: boolean;
 }
 
 const SVG = "http://www.w3.org/2000/svg";
+
+/** Pixels between two lines of a text. */
+const LINE_HEIGHT = 17;
 
 /** Length and half width of an arrow's head in pixels. */
 const HEAD = [13, 6] as const;
@@ -35,7 +39,11 @@ export class Overlay {
         const point = create("circle", { cx: x1, cy: y1, r: 5, class: owner });
         const head = create("polygon", { points: arrowHead(from, to), class: owner });
         const label = create("text", { x: x2 + 12, y: y2 - 10 });
-        label.textContent = text;
+        text.split("\n").forEach((part, index) => {
+            const span = create("tspan", { x: x2 + 12, dy: index > 0 ? LINE_HEIGHT : 0 });
+            span.textContent = part;
+            label.append(span);
+        });
         return [line, point, head, label];
     }
 }

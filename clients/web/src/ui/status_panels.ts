@@ -116,9 +116,12 @@ export class StatusPanels {
             return;
         }
         const text = model.forces.map(({ owner, force }) => {
+            const isOwn = owner === pull?.ownerNumber;
+            const newtons = force?.kind.case === "surface" ? norm(force.kind.value.vector as Vec3) : null;
+            const limit = (isOwn ? pull?.view?.limit : undefined) ?? null;
             const size =
-                force?.kind.case === "surface" ? format.newtons(norm(force.kind.value.vector as Vec3)) : "modal";
-            const who = owner === pull?.ownerNumber ? "you" : `viewer ${owner}`;
+                newtons === null ? "modal" : isOwn ? format.limitedNewtons(newtons, limit) : format.newtons(newtons);
+            const who = isOwn ? "you" : `viewer ${owner}`;
             return `${who}: ${size} on ${model.scene.domains[force?.domain ?? 0]?.name ?? "?"}`;
         });
         setText(this.forces, text.join("\n"));

@@ -112,6 +112,30 @@ async function checkColorRange(page: Page): Promise<void> {
     await page.locator("#legend").waitFor({ state: "hidden" });
 }
 
+/** Pulls the beam from a pixel, farther than it may bend: by a tenth of its length of 1 m. */
+async function checkForceLimit(page: Page, [x, y]: [number, number]): Promise<void> {
+    const text = (line: number) => page.locator("#overlay tspan").nth(line).textContent();
+    const view = () => page.evaluate(() => modalcastViewer.pull?.view);
+    await page.mouse.move(x + 20, y);
+    await page.waitForFunction(() => modalcastViewer.pull?.view?.isLimited === false);
+    assert.match((await text(0)) ?? "", /^[\d.]+ N of at most [\d.]+ N$/);
+    await page.mouse.move(x + 300, y);
+    await page.waitForFunction(() => modalcastViewer.pull?.view?.isLimited);
+    const pull = await view();
+    assert.equal(pull?.newtons, pull?.limit);
+    assert.match((await text(1)) ?? "", /mm now; the limit bends the part by 10 % of its size$/);
+    // q = f U_i / eigenvalue, and |q| is the deflection of the free end.
+    const point = await page.evaluate(() => [...(modalcastViewer.pull?.grabbed?.modes ?? [])]);
+    const [x0 = 0, , , y1 = 0] = point;
+    const direction = (pull?.to ?? []).map((value, axis) => value - (pull?.from[axis] ?? 0));
+    const length = Math.hypot(...direction);
+    const [fx = 0, fy = 0] = direction.map((component) => ((pull?.newtons ?? 0) * component) / length);
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const deflection = Math.hypot((x0 * fx) / eigenvalue(1), (y1 * fy) / eigenvalue(1.5));
+    assert.ok(deflection > 0.09 && deflection < 0.12, `expected 0.1 m at the free end, got ${deflection}`);
+    await page.getByText(/^you: [\d.]+ N of at most [\d.]+ N on beam$/).waitFor({ state: "attached" });
+}
+
 function coordinates(page: Page): Promise<number[]> {
     return page.evaluate(() => [...(modalcastViewer.model?.state.q ?? [])]);
 }
@@ -144,6 +168,7 @@ test("a one-part archive with eigenvalues is pulled, moves and rings down", { ti
     await page.waitForTimeout(500);
     await takeScreenshot(page, "view-npz-pulled");
     const pulled = await coordinates(page);
+    await checkForceLimit(page, [x, y]);
     await page.mouse.up();
     await page.keyboard.up("Shift");
     // It swings to the other side, and comes to rest.
