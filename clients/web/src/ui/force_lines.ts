@@ -53,8 +53,8 @@ export class ForceLines {
     }
 }
 
-/** Two lines: the force and its limit, then the deflection of the point or, at the limit, the reason of the limit. */
+/** The force and its limit, the deflection of the point and, at the limit, its reason. */
 function pullText({ newtons, limit, deflection, isLimited }: PullView): string {
-    const reason = isLimited ? ` now; the limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size` : "";
+    const reason = isLimited ? `\nThe limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.` : "";
     return `${format.limitedNewtons(newtons, limit)}\n${format.meters(deflection)}${reason}`;
 }

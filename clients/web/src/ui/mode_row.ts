@@ -7,6 +7,9 @@ import { icon } from "./icons";
 /** Milliseconds after the last key press in which a slider keeps its value: the state that shows it may arrive later. */
 const INPUT_MS = 1000;
 
+/** Steps of a slider from its middle to an end. */
+const STEPS = 200;
+
 /** The number of a mode for people, from 1, and its frequency in hertz if it is known. */
 export function modeName(mode: number, hertz: number): string {
     return `Mode ${mode + 1}${hertz > 0 ? `, ${format.frequency(hertz)}` : ""}`;
@@ -16,10 +19,11 @@ export class ModeRow {
     readonly element: HTMLElement;
     private readonly value = h("span", { className: "value" });
     private readonly bar = h("i");
-    private readonly track = h("div", { className: "track" }, this.bar);
     private readonly slider: HTMLInputElement;
     private readonly play: HTMLButtonElement;
     private lastInput = -Infinity;
+    /** q at the ends of the slider. */
+    private end = 1;
     onInput: (q: number) => void = () => {};
     onPlay: () => void = () => {};
 
@@ -29,10 +33,11 @@ export class ModeRow {
         readonly hertz: number,
         readonly metersPerQ: number,
     ) {
-        this.slider = h("input", { type: "range", aria: { label: `Mode ${mode + 1}` } });
+        const range = { min: String(-STEPS), max: String(STEPS), step: "1" };
+        this.slider = h("input", { type: "range", ...range, aria: { label: `Mode ${mode + 1}` } });
         this.slider.oninput = () => {
             this.lastInput = performance.now();
-            this.onInput(Number(this.slider.value));
+            this.onInput((Number(this.slider.value) / STEPS) * this.end);
         };
         this.play = h(
             "button",
@@ -40,14 +45,14 @@ export class ModeRow {
             icon("wave"),
         );
         this.play.onclick = () => this.onPlay();
+        const track = h("div", { className: "track" }, this.bar);
         const name = h("span", { className: "name", textContent: modeName(mode, hertz) });
-        this.element = h("div", { className: "mode" }, name, this.value, this.play, this.slider, this.track);
+        this.element = h("div", { className: "mode" }, name, this.value, this.play, track, this.slider);
     }
 
-    /** Shows a slider, or else a bar. */
+    /** Shows a slider on the bar. */
     setCanDrive(canDrive: boolean): void {
         this.slider.hidden = !canDrive;
-        this.track.hidden = canDrive;
         this.play.disabled = !canDrive;
     }
 
@@ -66,10 +71,8 @@ export class ModeRow {
         const { slider } = this;
         const isEdited = slider.matches(":active") || performance.now() - this.lastInput < INPUT_MS;
         if (document.activeElement === slider && isEdited) return;
-        slider.max = String(end);
-        slider.min = String(-end);
-        slider.step = String(end / 200);
-        slider.value = String(q);
+        this.end = end;
+        slider.value = String((STEPS * q) / end);
         slider.setAttribute("aria-valuetext", text);
     }
 

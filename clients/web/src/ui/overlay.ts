@@ -15,6 +15,9 @@ const SVG = "http://www.w3.org/2000/svg";
 /** Pixels between two lines of a text. */
 const LINE_HEIGHT = 17;
 
+/** Pixels between a text and the edge of the view. */
+const MARGIN = 8;
+
 /** Length and half width of an arrow's head in pixels. */
 const HEAD = [13, 6] as const;
 
@@ -24,6 +27,12 @@ export class Overlay {
     draw(lines: readonly OverlayLine[]): void {
         if (lines.length === 0 && !this.svg.firstChild) return;
         this.svg.replaceChildren(...lines.flatMap((line) => this.elements(line)));
+        const width = this.svg.clientWidth - MARGIN;
+        for (const label of this.svg.querySelectorAll("text")) {
+            const box = label.getBBox();
+            const [dx, dy] = [Math.min(0, width - box.x - box.width), Math.max(0, MARGIN - box.y)];
+            label.setAttribute("transform", `translate(${dx} ${dy})`);
+        }
     }
 
     private elements({ from, to, text, isOwn }: OverlayLine): SVGElement[] {
@@ -38,8 +47,9 @@ export class Overlay {
         const line = create("line", { x1, y1, x2, y2, class: owner });
         const point = create("circle", { cx: x1, cy: y1, r: 5, class: owner });
         const head = create("polygon", { points: arrowHead(from, to), class: owner });
-        const label = create("text", { x: x2 + 12, y: y2 - 10 });
-        text.split("\n").forEach((part, index) => {
+        const parts = text.split("\n");
+        const label = create("text", { y: y2 - 10 - LINE_HEIGHT * (parts.length - 1) });
+        parts.forEach((part, index) => {
             const span = create("tspan", { x: x2 + 12, dy: index > 0 ? LINE_HEIGHT : 0 });
             span.textContent = part;
             label.append(span);
