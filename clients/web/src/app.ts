@@ -358,13 +358,14 @@ export class App implements CommandHandlers {
         this.coordinates.update();
         if (!this.isPaused) this.fitColorScale(session);
         if (driver && !driver.isAnimating) this.coordinates.setAnimated(false);
-        this.updateTimeScale(isDriven);
+        this.updateTimeScale(session);
         this.status.update(session);
     }
 
     /** The panel shows every time scale, and the bar those that are at least two times slower or faster than real time. */
-    private updateTimeScale(isDriven: boolean): void {
-        const ratio = this.playback?.speed ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
+    private updateTimeScale({ driver, isDriven }: SceneSession): void {
+        const own = this.playback?.speed ?? driver?.timeScale ?? null;
+        const ratio = own ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
         this.status.timeScale = ratio;
         const isVisible = ratio !== null && (ratio <= 0.5 || ratio >= 2);
         this.bar.setTimeScale(isVisible ? format.timeScale(ratio) : "");

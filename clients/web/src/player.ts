@@ -2,6 +2,8 @@
 
 import type { App } from "./app";
 import { norm, subtract, type Vec3 } from "./scene/affine";
+import { lowestHertz } from "./scene/description";
+import { slowFactor } from "./scene/time_scale";
 import { Playback } from "./source/playback";
 import { decodeBase64, type Recording, readRecording } from "./source/recording";
 import { Timeline } from "./ui/timeline";
@@ -21,7 +23,7 @@ export class RecordingPlayer {
             const file = event.dataTransfer?.files[0];
             if (!file) return;
             onOpen();
-            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes)));
+            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes), null));
         });
     }
 
@@ -31,13 +33,13 @@ export class RecordingPlayer {
         if (!element?.textContent) return false;
         const text = element.textContent;
         element.remove();
-        const slow = Number(element.dataset["slow"] ?? 1);
-        this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : 1);
+        const slow = Number(element.dataset["slow"]);
+        this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : null);
         return true;
     }
 
-    /** @param slow Factor of the slow motion that is played first. */
-    private open(name: string, file: Uint8Array | (() => Uint8Array), slow = 1): void {
+    /** @param slow Factor of the slow motion that is played first; null: so that the lowest frequency is seen. */
+    private open(name: string, file: Uint8Array | (() => Uint8Array), slow: number | null): void {
         const { app } = this;
         this.close();
         try {
@@ -49,7 +51,7 @@ export class RecordingPlayer {
         }
     }
 
-    private play(name: string, recording: Recording, slow: number): void {
+    private play(name: string, recording: Recording, slow: number | null): void {
         const { app } = this;
         const { scene, arrays, view, isCutOff } = recording;
         const reason = app.drawingProblem(scene);
@@ -66,7 +68,7 @@ export class RecordingPlayer {
             app.notices.show("recording", text, { severity: "warn" });
         }
         const playback = new Playback(recording, model);
-        playback.speed = 1 / slow;
+        playback.speed = 1 / (slow ?? slowFactor(lowestHertz(scene)));
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);

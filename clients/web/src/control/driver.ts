@@ -4,6 +4,7 @@ import { Delivery } from "../proto/modalcast/v1/common_pb";
 import { Reason } from "../proto/modalcast/v1/errors_pb";
 import { type DriveSceneResponse, TransformFormat } from "../proto/modalcast/v1/steps_pb";
 import { TRANSFORM_SIZE } from "../scene/affine";
+import { hertzOf } from "../scene/description";
 import { Kinematics } from "../scene/kinematics";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
@@ -74,6 +75,14 @@ export class Driver {
 
     get isAnimating(): boolean {
         return this.animation !== null;
+    }
+
+    /** Seconds of the animated vibration per second of real time; null without one, or if its frequency is unknown. */
+    get timeScale(): number | null {
+        if (!this.animation) return null;
+        const { domain, mode, frequency } = this.animation;
+        const hertz = hertzOf(this.model.scene, domain, mode);
+        return hertz > 0 ? frequency / hertz : null;
     }
 
     /** Releases the writer lease. */

@@ -5,16 +5,10 @@
 
 import { applyLinear, norm, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
 import { type Deflections, LARGEST_DEFLECTION } from "../scene/deflection";
-import { eigenvaluesOf } from "../scene/description";
+import { eigenvaluesOf, largestRigidEigenvalue } from "../scene/description";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import type { SurfacePoint } from "./surface_point";
-
-/**
- * Largest eigenvalue of a mode that may be a rigid motion, as a fraction of the largest of its domain. Solvers return
- * rounding errors for these; the physics process holds such modes still, so they do not count for the compliance.
- */
-const RIGID_TOLERANCE = 1e-9;
 
 /** Two directions with a larger cosine have one limit. The angle between them is 1 degree. */
 const SAME_DIRECTION = Math.cos(Math.PI / 180);
@@ -72,7 +66,7 @@ export function pointCompliance(
     const { scene, state, layout } = model;
     const rank = at(layout.ranks, domain);
     const eigenvalues = eigenvaluesOf(scene, domain);
-    const smallest = RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);
+    const largestRigid = largestRigidEigenvalue(eigenvalues);
     const responses = [0, 1, 2].map(() => new Float64Array(rank));
     const rows = Array.from({ length: rank }, (_, mode) => {
         const column = [0, 1, 2].map((axis) => at(modes, axis * rank + mode));
@@ -81,7 +75,7 @@ export function pointCompliance(
     let compliance = 0;
     rows.forEach((row, mode) => {
         const eigenvalue = eigenvalues[mode] ?? 0;
-        if (!(eigenvalue > smallest)) return;
+        if (!(eigenvalue > largestRigid)) return;
         responses.forEach((response, axis) => (response[mode] = at(row, axis) / eigenvalue));
         compliance += norm(row) ** 2 / eigenvalue;
     });

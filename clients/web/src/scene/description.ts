@@ -12,6 +12,9 @@ import { Array as ArrayKind } from "../proto/modalcast/v1/scenes_pb";
 
 export { ArrayKind };
 
+/** Largest eigenvalue of a rigid motion as a fraction of the largest of its domain. */
+const RIGID_TOLERANCE = 1e-9;
+
 export interface SceneDescription {
     info: SceneInfo;
     shapes: ShapeDescription[];
@@ -94,6 +97,25 @@ export function rankOf(scene: SceneDescription, domain: DomainDescription): numb
 export function eigenvaluesOf(scene: SceneDescription, domain: number): readonly number[] {
     const description = scene.domains[domain];
     return description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? -1]?.eigenvalues ?? [];
+}
+
+/**
+ * Largest eigenvalue of a mode that may be a rigid motion. Solvers return rounding errors for these; the physics process
+ * holds such modes still.
+ */
+export function largestRigidEigenvalue(eigenvalues: readonly number[]): number {
+    return RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);
+}
+
+/** The lowest frequency of all vibrations in hertz; 0 if it is unknown. */
+export function lowestHertz(scene: SceneDescription): number {
+    const lowest = scene.domains.map(({ domain }) => {
+        const eigenvalues = eigenvaluesOf(scene, domain);
+        const smallest = largestRigidEigenvalue(eigenvalues);
+        return Math.min(...eigenvalues.filter((value) => value > smallest));
+    });
+    const smallest = lowest.reduce((least, value) => Math.min(least, value), Infinity);
+    return Number.isFinite(smallest) ? Math.sqrt(smallest) / (2 * Math.PI) : 0;
 }
 
 /** Frequency of a mode in hertz; 0 if it is unknown, or if the mode has no stiffness. */

@@ -59,10 +59,22 @@ export function timeScale(ratio: number): string {
     return ratio <= 0.5 ? `1/${rounded(1 / ratio)} of real time` : `${rounded(ratio)}x real time`;
 }
 
+/** A selected speed: a fraction or a multiple of real time. */
+export function speed(value: number): string {
+    return value < 1 ? `1/${short(1 / value)}` : `${short(value)}x`;
+}
+
 /** A measured number with one significant digit if the difference is at most 3 %, or else with two. */
 function rounded(value: number): string {
     const digit = Number(value.toPrecision(1));
     return String(Math.abs(digit / value - 1) <= 0.03 ? digit : Number(value.toPrecision(2)));
+}
+
+/** Where a scene comes from, by its `SceneInfo.source`. */
+export function sceneSource(source: string): string {
+    const [, path] = /^uploaded(?:: (.*))?$/s.exec(source) ?? [null, null];
+    if (path === null) return `from ${source}`;
+    return path ? `sent by a program: ${path}` : "sent by a program";
 }
 
 export function count(value: number | bigint): string {
