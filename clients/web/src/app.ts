@@ -70,7 +70,7 @@ export class App implements CommandHandlers {
         this.remarks = new RemarksSection(this.panel, this.notices);
         this.panel.add("View", this.view.element, true);
         this.panel.add("Modes", this.coordinates.element, true);
-        this.panel.add("Domains", this.domains.element, false);
+        this.panel.add("Parts", this.domains.element, false);
         this.status = new StatusPanels(this.panel, this.settings, this.viewport);
         this.toolbar = createToolbar(this);
         listenToKeys(this);
@@ -131,7 +131,7 @@ export class App implements CommandHandlers {
         this.view.restrict(renderer !== null, source.features.pictures, hint);
         this.view.setModes(scene.shapes.reduce((largest, shape) => Math.max(largest, shape.rank), 0));
         this.domains.setScene(scene);
-        this.panel.setCount("Domains", format.count(scene.domains.length));
+        this.panel.setCount("Parts", format.count(scene.domains.length));
         this.status.showScene(scene.info);
         this.remarks.set(scene.info.remarks);
         this.frameOnce(scene);
@@ -353,7 +353,7 @@ export class App implements CommandHandlers {
         const { session } = this;
         if (!session) return;
         const { driver, source, isDriven } = session;
-        const driven = isDriven ? "A physics process drives this scene." : this.driveHint;
+        const driven = isDriven ? "A physics process controls this scene." : this.driveHint;
         this.coordinates.setCanDrive(source.features.drive && !isDriven, source.features.drive ? driven : "");
         this.coordinates.update();
         if (!this.isPaused) this.fitColorScale(session);

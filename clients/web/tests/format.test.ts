@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { frequency, limitedNewtons, seconds, signedMeters, timeScale } from "../src/ui/format";
+import { frequency, limitedNewtons, sceneSource, seconds, signedMeters, timeScale } from "../src/ui/format";
 
 test("a frequency has at most four digits before its unit", () => {
     const texts = [0.25, 206.1, 1265, 12_651, 1.5e6].map(frequency);
@@ -35,4 +35,14 @@ test("a force names its limit or says that it is unknown", () => {
     assert.equal(limitedNewtons(120, 380.4), "120 N of at most 380 N");
     assert.equal(limitedNewtons(120, null), "120 N, limit unknown");
     assert.equal(limitedNewtons(0, Infinity), "0 N");
+});
+
+test("the source of a scene is a file or a program", () => {
+    const texts = ["tree", "parts/bracket.stl", "uploaded", "uploaded: a/scene.toml"].map(sceneSource);
+    assert.deepEqual(texts, [
+        "from tree",
+        "from parts/bracket.stl",
+        "sent by a program",
+        "sent by a program: a/scene.toml",
+    ]);
 });

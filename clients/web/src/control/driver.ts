@@ -134,7 +134,7 @@ export class Driver {
             const isTaken = reason === Reason.WRITER_LEASE_TAKEN;
             this.refuse(
                 isTaken
-                    ? "Another program drives this scene. Only one program at a time may set q: stop it to use the sliders."
+                    ? "Another program controls this scene. Only one program at a time can: stop it to use the sliders."
                     : `The server rejected a step: ${field}: expected ${expected}, got ${given}.`,
             );
             return false;

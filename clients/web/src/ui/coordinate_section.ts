@@ -17,6 +17,8 @@ const MAX_MODES = 40;
 const FASTEST_HERTZ = 1;
 const DEFAULT_HERTZ = 0.7;
 
+const PART = "A part of the scene has its own mesh and modes. Programs call it a domain.";
+
 export interface CoordinateHandlers {
     set(domain: number, mode: number, value: number): void;
     animate(domain: number, mode: number, amplitude: number, frequency: number): void;
@@ -55,7 +57,7 @@ export class CoordinateSection {
         this.row = h(
             "div",
             { className: "row" },
-            h("label", { htmlFor: "q-domain", textContent: "Part" }),
+            h("label", { htmlFor: "q-domain", textContent: "Part", title: PART }),
             this.select,
         );
         const label = h("label", { htmlFor: "deflection", textContent: "Deflection" });

@@ -46,11 +46,11 @@ export class StatusPanels {
             .map((axis) => format.short((at(bounds, 3 + axis) - at(bounds, axis)) * unit))
             .join(" x ");
         this.scene.set({
-            Source: info.source,
-            Domains: format.count(info.domains),
+            Source: format.sceneSource(info.source),
+            Parts: format.count(info.domains),
             Vertices: format.count(info.vertices),
             Triangles: format.count(info.triangles),
-            Coordinates: format.count(info.coordinates),
+            Modes: format.count(info.coordinates),
             Size: `${size} m`,
             Unit: unit === 1 ? null : `${format.short(unit)} m`,
             "Up axis": info.up,
@@ -79,7 +79,7 @@ export class StatusPanels {
             ),
             "Round trip": source.server ? `${this.latency.toFixed(1)} ms` : null,
             "Error of this view": this.errorText({ model, renderer }),
-            "Storage of U": renderer && model.layout.coordinates > 0 ? storage : null,
+            "Storage of modes": renderer && model.layout.coordinates > 0 ? storage : null,
             "Graphics memory": renderer ? format.bytes(renderer.deformer.bytes + meshBytes(model.scene)) : null,
             Step: step ? `${step.number} at ${format.seconds(step.time)}` : "rest state",
             "Time scale": this.timeScale === null ? null : format.timeScale(this.timeScale),

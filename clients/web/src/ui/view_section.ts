@@ -21,7 +21,7 @@ export class ViewSection {
     constructor(private readonly settings: Settings) {
         this.local = h("button", {
             textContent: "Browser",
-            title: "Load the mesh and U once, then receive only q and T",
+            title: "Load the mesh and the modes once, then receive only the motion",
         });
         this.server = h("button", { textContent: "Server", title: "Show the pictures that the server draws" });
         this.local.onclick = () => this.set(() => (settings.pictures = false));

@@ -123,7 +123,14 @@ async function checkForceLimit(page: Page, [x, y]: [number, number]): Promise<vo
     await page.waitForFunction(() => modalcastViewer.pull?.view?.isLimited);
     const pull = await view();
     assert.equal(pull?.newtons, pull?.limit);
-    assert.match((await text(1)) ?? "", /mm now; the limit bends the part by 10 % of its size$/);
+    assert.match((await text(1)) ?? "", /mm$/);
+    assert.equal(await text(2), "The limit bends the part by 10 % of its size.");
+    const [label, stage] = await page.evaluate(() =>
+        ["#overlay text", "#stage"].map(
+            (selector) => document.querySelector(selector)?.getBoundingClientRect().right ?? 0,
+        ),
+    );
+    assert.ok(label && stage && label < stage, `expected the text left of ${stage}, got ${label}`);
     // q = f U_i / eigenvalue, and |q| is the deflection of the free end.
     const point = await page.evaluate(() => [...(modalcastViewer.pull?.grabbed?.modes ?? [])]);
     const [x0 = 0, , , y1 = 0] = point;
@@ -222,7 +229,7 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     const triangle = "mtllib absent.mtl\nv 0 0 0\nv 200 0 0\nv 0 200 0\nf 1 2 3\n";
     const shown = await view("triangle.obj", triangle, ["--no-sim"]);
     const { page } = shown;
-    const notice = page.locator(".notice", { hasText: "2 remarks on the files of this scene." });
+    const notice = page.locator(".notice", { hasText: "2 notes on the files of this scene." });
     await notice.getByRole("button", { name: "Show" }).click();
     await notice.waitFor({ state: "hidden" });
     const remarks = await page.locator("ul.remarks li").allTextContents();
@@ -234,7 +241,7 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     await close(shown);
     const plain = await view("triangle.obj", triangle.replace("mtllib absent.mtl\n", ""), ["--no-sim", "--unit", "mm"]);
     assert.equal(await plain.page.locator(".notice").count(), 0, "control");
-    assert.equal(await plain.page.locator("summary", { hasText: "Remarks" }).isVisible(), false, "control");
+    assert.equal(await plain.page.locator("summary", { hasText: "Notes on files" }).isVisible(), false, "control");
     await close(plain);
 });
 
@@ -257,6 +264,35 @@ test("a stiff body is shown in slow motion, which the page names", { timeout: LI
         await takeScreenshot(page, `view-slow-${options[1] ?? "default"}`);
         await close(shown);
     }
+});
+
+test("an animated mode of a stiff body is slowed down, and the page says by which factor", {
+    timeout: LIMIT_MS,
+}, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("fork.npz", new Beam().npz([eigenvalue(450), eigenvalue(600)]), ["--no-sim"]);
+    const { page } = shown;
+    const bar = page.locator("#time-scale");
+    assert.equal(await bar.isVisible(), false, "control: nothing moves");
+    await page.getByText("Mode 1, 450 Hz").waitFor();
+    // The beam has a size of 1.01 m. The end turns, too, so a corner moves by 1.007 m per unit of q.
+    assert.equal(await page.locator(".mode-scale").textContent(), "−100 mm0+100 mm");
+    await page.getByRole("button", { name: "Animate mode 1", exact: true }).click();
+    await bar.filter({ hasText: "1/450 of real time" }).waitFor();
+    await page.waitForFunction(() => (modalcastViewer.model?.state.q[0] ?? 0) > 0.03);
+    await takeScreenshot(page, "view-animated-mode");
+    await page.getByRole("button", { name: "Animate mode 1", exact: true }).click();
+    await bar.waitFor({ state: "hidden" });
+    await page.getByRole("slider", { name: "Mode 2", exact: true }).focus();
+    await page.keyboard.press("End");
+    await page.locator("#deflection", { hasText: /^100 mm$/ }).waitFor();
+    assert.equal(await page.locator(".mode .value").nth(1).textContent(), "+100 mm");
+    assert.equal(
+        await page.locator(".mode .value").nth(1).getAttribute("title"),
+        "q[1] = 0.0993, counted from 0 as in programs",
+    );
+    await takeScreenshot(page, "view-slider");
+    await close(shown);
 });
 
 for (const [name, content, reason] of [
