@@ -15,8 +15,11 @@ const SVG = "http://www.w3.org/2000/svg";
 /** Pixels between two lines of a text. */
 const LINE_HEIGHT = 17;
 
-/** Pixels between a text and the edge of the view. */
+/** Pixels between a text and the right edge of the view. */
 const MARGIN = 8;
+
+/** Pixels at the top of the view that the bar may cover: a text is then below its arrow. */
+const TOP = 60;
 
 /** Length and half width of an arrow's head in pixels. */
 const HEAD = [13, 6] as const;
@@ -30,8 +33,7 @@ export class Overlay {
         const width = this.svg.clientWidth - MARGIN;
         for (const label of this.svg.querySelectorAll("text")) {
             const box = label.getBBox();
-            const [dx, dy] = [Math.min(0, width - box.x - box.width), Math.max(0, MARGIN - box.y)];
-            label.setAttribute("transform", `translate(${dx} ${dy})`);
+            label.setAttribute("transform", `translate(${Math.min(0, width - box.x - box.width)} 0)`);
         }
     }
 
@@ -48,7 +50,8 @@ export class Overlay {
         const point = create("circle", { cx: x1, cy: y1, r: 5, class: owner });
         const head = create("polygon", { points: arrowHead(from, to), class: owner });
         const parts = text.split("\n");
-        const label = create("text", { y: y2 - 10 - LINE_HEIGHT * (parts.length - 1) });
+        const above = y2 - 10 - LINE_HEIGHT * (parts.length - 1);
+        const label = create("text", { y: above - LINE_HEIGHT < TOP ? y2 + 26 : above });
         parts.forEach((part, index) => {
             const span = create("tspan", { x: x2 + 12, dy: index > 0 ? LINE_HEIGHT : 0 });
             span.textContent = part;
