@@ -191,6 +191,19 @@ export async function waitForScene(page: Page): Promise<void> {
     await page.waitForFunction(() => Boolean(globalThis.modalcastViewer?.model));
 }
 
+/** Drops a file onto the page. */
+export async function drop(page: Page, name: string, bytes: Buffer): Promise<void> {
+    await page.evaluate(
+        ([fileName, base64]) => {
+            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
+            const dataTransfer = new DataTransfer();
+            dataTransfer.items.add(new File([content], fileName));
+            window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+        },
+        [name, bytes.toString("base64")] as const,
+    );
+}
+
 /** Draws the current state, and remembers its pixels in the page. */
 export async function rememberPixels(page: Page): Promise<void> {
     await comparePixels(page, true);

@@ -12,6 +12,7 @@ import { type Recording, readRecording } from "../../src/source/recording";
 import {
     changedValues,
     committedPage,
+    drop,
     end,
     launchBrowser,
     openPage,
@@ -195,19 +196,6 @@ test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, a
     assert.deepEqual(errors, []);
     await page.close();
 });
-
-/** Drops a file onto the page. */
-async function drop(page: Page, name: string, bytes: Buffer): Promise<void> {
-    await page.evaluate(
-        ([fileName, base64]) => {
-            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
-            const dataTransfer = new DataTransfer();
-            dataTransfer.items.add(new File([content], fileName));
-            window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
-        },
-        [name, bytes.toString("base64")] as const,
-    );
-}
 
 test("a page with a damaged recording says so", { timeout: LIMIT_MS }, async () => {
     const damaged = readFileSync(exportedPage, "utf8");

@@ -7,10 +7,12 @@ import { join } from "node:path";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
 import {
+    drop,
     end,
     launchBrowser,
     openPage,
     printedUrl,
+    runProgram,
     startProgram,
     temporaryFolder,
     type ViewerPage,
@@ -37,6 +39,7 @@ after(async () => {
 /** `modalcast view` of a model file, and its page. */
 interface View extends ViewerPage {
     program: ChildProcess;
+    url: string;
 }
 
 async function view(name: string, content: Buffer | string, modeling: string[] = []): Promise<View> {
@@ -48,7 +51,7 @@ async function view(name: string, content: Buffer | string, modeling: string[] =
     const url = await printedUrl(program, "open");
     const viewerPage = await openPage(browser, url, WIDTH, HEIGHT);
     await waitForScene(viewerPage.page);
-    return { ...viewerPage, program };
+    return { ...viewerPage, program, url };
 }
 
 async function close({ page, errors, program }: View): Promise<void> {
@@ -262,6 +265,31 @@ test("a stiff body is shown in slow motion, which the page names", { timeout: LI
         if (text) assert.equal(await bar.textContent(), text);
         else assert.equal(await bar.isVisible(), false, "expected no remark on real time");
         await takeScreenshot(page, `view-slow-${options[1] ?? "default"}`);
+        await close(shown);
+    }
+});
+
+test("a recording of a stiff body that is dropped onto the page plays in slow motion", {
+    timeout: LIMIT_MS,
+}, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    for (const [hertz, text] of [
+        [450, "1/200 of real time"],
+        [3, null],
+    ] as const) {
+        const shown = await view("fork.npz", new Beam().npz([eigenvalue(hertz), eigenvalue(600)]));
+        const { page } = shown;
+        const file = join(temporaryFolder(), "fork.mcap");
+        const server = new URL(shown.url).origin;
+        await runProgram("modalcast-record", ["record", "fork", "--out", file, "--server", server, "--steps", "30"]);
+        await drop(page, "fork.mcap", readFileSync(file));
+        await page.getByRole("slider", { name: "Time in seconds" }).waitFor();
+        const speed = await page.getByRole("combobox", { name: "Speed" }).inputValue();
+        assert.equal(Number(speed), text ? 1 / 200 : 1);
+        const bar = page.locator("#time-scale");
+        if (text) await bar.filter({ hasText: text }).waitFor();
+        else assert.equal(await bar.isVisible(), false, "control");
+        await takeScreenshot(page, `view-recording-${hertz}-hertz`);
         await close(shown);
     }
 });
