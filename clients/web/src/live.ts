@@ -197,7 +197,7 @@ export class LiveViewer {
         const choices = [
             ...open.map(([name, source]) => ({
                 label: name,
-                detail: `open, ${format.sceneSource(source)}`,
+                detail: `open, from ${source}`,
                 run: () => void this.select(`open:${name}`),
             })),
             ...sources.map((source) => ({

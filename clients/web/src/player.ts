@@ -2,8 +2,6 @@
 
 import type { App } from "./app";
 import { norm, subtract, type Vec3 } from "./scene/affine";
-import { lowestHertz } from "./scene/description";
-import { slowFactor } from "./scene/time_scale";
 import { Playback } from "./source/playback";
 import { decodeBase64, type Recording, readRecording } from "./source/recording";
 import { Timeline } from "./ui/timeline";
@@ -23,7 +21,7 @@ export class RecordingPlayer {
             const file = event.dataTransfer?.files[0];
             if (!file) return;
             onOpen();
-            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes), null));
+            void file.arrayBuffer().then((bytes) => this.open(file.name, new Uint8Array(bytes)));
         });
     }
 
@@ -39,7 +37,7 @@ export class RecordingPlayer {
     }
 
     /** @param slow Factor of the slow motion that is played first; null: so that the lowest frequency is seen. */
-    private open(name: string, file: Uint8Array | (() => Uint8Array), slow: number | null): void {
+    private open(name: string, file: Uint8Array | (() => Uint8Array), slow: number | null = null): void {
         const { app } = this;
         this.close();
         try {
@@ -68,7 +66,7 @@ export class RecordingPlayer {
             app.notices.show("recording", text, { severity: "warn" });
         }
         const playback = new Playback(recording, model);
-        playback.speed = 1 / (slow ?? slowFactor(lowestHertz(scene)));
+        if (slow !== null) playback.speed = 1 / slow;
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { frequency, limitedNewtons, sceneSource, seconds, signedMeters, timeScale } from "../src/ui/format";
+import { frequency, seconds, timeScale } from "../src/ui/format";
 
 test("a frequency has at most four digits before its unit", () => {
     const texts = [0.25, 206.1, 1265, 12_651, 1.5e6].map(frequency);
@@ -24,25 +24,4 @@ test("a time scale is a fraction or a multiple of real time", () => {
 test("times of slow motion are in milliseconds or microseconds", () => {
     const texts = [seconds(12.345), seconds(0), seconds(0.0125), seconds(2e-5), seconds(0.02, 4), seconds(0, 0.1)];
     assert.deepEqual(texts, ["12.35 s", "0.00 s", "12.5 ms", "20.0 µs", "0.02 s", "0.0 ms"]);
-});
-
-test("a deflection has a sign and a unit that fits", () => {
-    const texts = [0.0026, -0.00013, 0, 1.5, -2.5e-8].map(signedMeters);
-    assert.deepEqual(texts, ["+2.6 mm", "−130 µm", "0 m", "+1.5 m", "−25 nm"]);
-});
-
-test("a force names its limit or says that it is unknown", () => {
-    assert.equal(limitedNewtons(120, 380.4), "120 N of at most 380 N");
-    assert.equal(limitedNewtons(120, null), "120 N, limit unknown");
-    assert.equal(limitedNewtons(0, Infinity), "0 N");
-});
-
-test("the source of a scene is a file or a program", () => {
-    const texts = ["tree", "parts/bracket.stl", "uploaded", "uploaded: a/scene.toml"].map(sceneSource);
-    assert.deepEqual(texts, [
-        "from tree",
-        "from parts/bracket.stl",
-        "sent by a program",
-        "sent by a program: a/scene.toml",
-    ]);
 });

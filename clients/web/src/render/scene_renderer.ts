@@ -94,6 +94,7 @@ export class SceneRenderer {
         this.surfaces.setShadows(this.options.shadows);
         this.background.define("SHADOWS", this.options.shadows);
         this.surfaces.setEdges(options.edges);
+        if (!isMap) this.surfaces.setColorMode({ kind: "shaded" });
         this.surfaces.setLinearOutput(this.needsBlending);
         for (const pass of this.backgrounds) pass.define("LINEAR_OUTPUT", this.needsBlending);
         if (!this.needsBlending) this.transparency.release();
@@ -102,14 +103,7 @@ export class SceneRenderer {
         this.setUniform(this.tone, "tone", isMap ? 0 : this.lighting.tone);
         this.background.mesh.visible = !isMap;
         this.plain.mesh.visible = isMap;
-        if (!isMap) this.surfaces.setColorMode({ kind: "shaded" });
         if (this.state) this.update(this.state);
-    }
-
-    /** @param end The value at the bright end of the color map, in meters, or in meters per unit of q. */
-    setColorScale(end: number): void {
-        if (this.options.color.kind === "shaded") return;
-        this.surfaces.setColorMode({ kind: "map", largest: end / this.scene.info.unit });
     }
 
     setDisplay(display: DomainDisplay): void {
@@ -121,6 +115,12 @@ export class SceneRenderer {
     update(state: SceneState): void {
         this.state = state;
         this.needsDeformation = true;
+    }
+
+    /** @param end The value at the bright end of the color map, in meters, or in meters per unit of q. */
+    setColorScale(end: number): void {
+        if (this.options.color.kind === "shaded") return;
+        this.surfaces.setColorMode({ kind: "map", largest: end / this.scene.info.unit });
     }
 
     private deform(state: SceneState): void {

@@ -70,13 +70,6 @@ function rounded(value: number): string {
     return String(Math.abs(digit / value - 1) <= 0.03 ? digit : Number(value.toPrecision(2)));
 }
 
-/** Where a scene comes from, by its `SceneInfo.source`. */
-export function sceneSource(source: string): string {
-    const [, path] = /^uploaded(?:: (.*))?$/s.exec(source) ?? [null, null];
-    if (path === null) return `from ${source}`;
-    return path ? `sent by a program: ${path}` : "sent by a program";
-}
-
 export function count(value: number | bigint): string {
     return value.toLocaleString("en-US");
 }

@@ -46,7 +46,7 @@ export class StatusPanels {
             .map((axis) => format.short((at(bounds, 3 + axis) - at(bounds, axis)) * unit))
             .join(" x ");
         this.scene.set({
-            Source: format.sceneSource(info.source),
+            Source: info.source,
             Parts: format.count(info.domains),
             Vertices: format.count(info.vertices),
             Triangles: format.count(info.triangles),

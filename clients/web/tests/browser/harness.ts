@@ -186,22 +186,22 @@ async function serveCommittedPage(page: Page): Promise<void> {
     await page.route(isPage, (route) => route.fulfill({ body: committedPage(), contentType: "text/html" }));
 }
 
+/** Drops files onto the page. */
+export async function dropFiles(page: Page, files: Record<string, Buffer | string>): Promise<void> {
+    const entries = Object.entries(files).map(([name, content]) => [name, Buffer.from(content).toString("base64")]);
+    await page.evaluate((list) => {
+        const dataTransfer = new DataTransfer();
+        for (const [name = "", base64 = ""] of list) {
+            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
+            dataTransfer.items.add(new File([content], name));
+        }
+        window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
+    }, entries);
+}
+
 /** Waits until the page shows a scene. */
 export async function waitForScene(page: Page): Promise<void> {
     await page.waitForFunction(() => Boolean(globalThis.modalcastViewer?.model));
-}
-
-/** Drops a file onto the page. */
-export async function drop(page: Page, name: string, bytes: Buffer): Promise<void> {
-    await page.evaluate(
-        ([fileName, base64]) => {
-            const content = Uint8Array.from(atob(base64), (character) => character.charCodeAt(0));
-            const dataTransfer = new DataTransfer();
-            dataTransfer.items.add(new File([content], fileName));
-            window.dispatchEvent(new DragEvent("drop", { dataTransfer, cancelable: true }));
-        },
-        [name, bytes.toString("base64")] as const,
-    );
 }
 
 /** Draws the current state, and remembers its pixels in the page. */

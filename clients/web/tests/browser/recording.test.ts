@@ -12,7 +12,7 @@ import { type Recording, readRecording } from "../../src/source/recording";
 import {
     changedValues,
     committedPage,
-    drop,
+    dropFiles,
     end,
     launchBrowser,
     openPage,
@@ -182,9 +182,9 @@ test("a recording that is dropped onto the page plays", { timeout: LIMIT_MS }, a
     const { page, errors } = await openPage(browser, pathToFileURL(viewerPage).href, WIDTH, HEIGHT);
     // Control: without a recording there is nothing to play.
     await page.getByRole("heading", { name: "No recording" }).waitFor();
-    await drop(page, "cut.mcap", readFileSync(file).subarray(0, 3000));
+    await dropFiles(page, { "cut.mcap": readFileSync(file).subarray(0, 3000) });
     await page.getByRole("heading", { name: "The recording cannot be played" }).waitFor();
-    await drop(page, "tree.mcap", readFileSync(file));
+    await dropFiles(page, { "tree.mcap": readFileSync(file) });
     await checkPlayback(page);
     // A pull says that a recording does not react.
     const notice = page.locator(".notice", { hasText: "does not react to forces" }).waitFor();

@@ -7,7 +7,7 @@ import { join } from "node:path";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
 import {
-    drop,
+    dropFiles,
     end,
     launchBrowser,
     openPage,
@@ -282,7 +282,7 @@ test("a recording of a stiff body that is dropped onto the page plays in slow mo
         const file = join(temporaryFolder(), "fork.mcap");
         const server = new URL(shown.url).origin;
         await runProgram("modalcast-record", ["record", "fork", "--out", file, "--server", server, "--steps", "30"]);
-        await drop(page, "fork.mcap", readFileSync(file));
+        await dropFiles(page, { "fork.mcap": readFileSync(file) });
         await page.getByRole("slider", { name: "Time in seconds" }).waitFor();
         const speed = await page.getByRole("combobox", { name: "Speed" }).inputValue();
         assert.equal(Number(speed), text ? 1 / 200 : 1);
