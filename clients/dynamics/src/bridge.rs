@@ -292,7 +292,7 @@ impl Scenario for BridgeScenario {
             )),
         };
         let modes = system.frequencies().into_iter().enumerate();
-        let modes = modes.map(|(mode, hertz)| (format!("mode {mode}"), hertz));
+        let modes = modes.map(|(mode, hertz)| (format!("mode {}", mode + 1), hertz));
         let unresolved = nyquist_remark(modes.chain(self.linear_modes.frequencies(&self.model)), self.options.dt);
         let unresolved_load = aliasing_remark("the load", self.options.period, self.options.dt);
         let remarks = [unresolved_load, undamped, unstable, unresolved];

@@ -48,13 +48,13 @@ print("Frequencies in Hz:", np.round(np.sqrt(eigenvalues) / (2 * np.pi), 1))
 builder = mc.SceneBuilder("beams", up="z")
 for mode, color in enumerate(COLORS):
     placement = np.eye(4) + np.outer((0, 1.5 * mode, 1.2, 0), (0, 0, 0, 1))
-    builder.add(mesh.p.T, faces, U, name=f"mode {mode}", eigenvalues=eigenvalues, placement=placement, color=color)
+    builder.add(mesh.p.T, faces, U, name=f"mode {mode + 1}", eigenvalues=eigenvalues, placement=placement, color=color)
 wall = skfem.MeshTet().scaled((0.4, 6.0, 1.6)).translated((-0.4, -0.5, 0.5))
 builder.add(wall.p.T, surface(wall), name="wall", color=(0.5, 0.5, 0.5))
 with mc.connect(sys.argv[1]) if len(sys.argv) > 1 else mc.spawn() as client:
     scene = client.upload(builder, replace=True)
     amplitudes = TIPS / np.linalg.norm(U.reshape(-1, 3, len(TIPS)), axis=1).max(axis=0)
     with scene.drive() as drive:
-        drive.step(q={f"mode {mode}": q for mode, q in enumerate(np.diag(amplitudes))})
+        drive.step(q={f"mode {mode + 1}": q for mode, q in enumerate(np.diag(amplitudes))})
     camera = mc.look_at(eye=(11.5, -5.0, 6.0), target=(1.9, 2.0, 1.05), field_of_view=20)
     scene.frame(camera).save("beam.png")

@@ -58,7 +58,7 @@ export class App implements CommandHandlers {
     private readonly axes = new AxesGizmo((toCamera) => this.viewport.camera.lookAlong(toCamera));
     private readonly scaleBar = new ScaleBar();
     private readonly pullGesture = new PullGesture(this.stage);
-    private session: SceneSession | null = null;
+    session: SceneSession | null = null;
     /** The recording that is shown; null for a server. */
     playback: Playback | null = null;
     private isPaused = false;
@@ -76,8 +76,8 @@ export class App implements CommandHandlers {
         });
         this.remarks = new RemarksSection(this.panel, this.notices);
         this.panel.add("View", this.view.element, true);
-        this.panel.add("Coordinates", this.coordinates.element, true);
-        this.panel.add("Domains", this.domains.element, false);
+        this.panel.add("Modes", this.coordinates.element, true);
+        this.panel.add("Parts", this.domains.element, false);
         this.status = new StatusPanels(this.panel, this.settings, this.viewport);
         this.capture = new Capture(this.viewport, this.status.legend, this.notices);
         this.toolbar = createToolbar(this);
@@ -140,15 +140,12 @@ export class App implements CommandHandlers {
         this.view.restrict(renderer !== null, source.features.pictures, hint);
         this.view.setModes(scene.shapes.reduce((largest, shape) => Math.max(largest, shape.rank), 0));
         this.domains.setScene(scene);
-        this.panel.setCount("Domains", format.count(scene.domains.length));
+        this.panel.setCount("Parts", format.count(scene.domains.length));
         this.status.showScene(scene.info);
         this.remarks.set(scene.info.remarks);
         this.frameOnce(scene);
         this.connectSession(session);
-        this.coordinates.setScene(
-            model,
-            (domain) => renderer?.deformer.packed[scene.domains[domain]?.shape ?? -1]?.norms ?? null,
-        );
+        this.coordinates.setScene(model, session.deflections);
         this.forceLines.setSession(session);
         this.cover.hide();
         document.title = `${scene.info.scene} - modalcast`;
@@ -235,11 +232,7 @@ export class App implements CommandHandlers {
 
     nextColor = (): void => {
         if (!this.model || this.model.layout.coordinates === 0) return;
-        const { settings } = this;
-        this.change(() => {
-            settings.color = settings.color.kind === "shaded" ? { kind: "displacement" } : { kind: "shaded" };
-            this.view.showColor();
-        });
+        this.change(() => this.view.nextColor());
     };
 
     toggleEdges = (): void => this.change(() => (this.settings.edges = !this.settings.edges));
@@ -292,6 +285,14 @@ export class App implements CommandHandlers {
         // A step that changes nothing has no bytes.
         if (model.lastStateBytes === 0) return;
         if (!this.settings.pictures) renderer?.update(model.state);
+        this.fitColorScale(session);
+        this.viewport.invalidate();
+    }
+
+    private fitColorScale({ colorScale, renderer, pictures }: SceneSession): void {
+        if (!colorScale.update(performance.now())) return;
+        renderer?.setColorScale(colorScale.end);
+        if (this.settings.pictures) pictures?.start(this.pictureOptions());
         this.viewport.invalidate();
     }
 
@@ -312,6 +313,8 @@ export class App implements CommandHandlers {
             session.renderer.setOptions(settings);
             session.renderer.update(session.model.state);
         }
+        session?.colorScale.select(settings.color, performance.now());
+        session?.renderer?.setColorScale(session.colorScale.end);
         if (settings.pictures) session?.pictures?.start(this.pictureOptions());
         else session?.pictures?.stop();
         this.capture.followView(this.fileName);
@@ -330,7 +333,7 @@ export class App implements CommandHandlers {
             camera: viewport.camera.toMessage(),
             output: outputs[settings.color.kind],
             mode: settings.color.kind === "mode" ? settings.color.mode : 0,
-            largest: this.renderer?.colorScale ?? 0,
+            largest: this.session?.colorScale.end ?? 0,
             edges: settings.edges,
         };
     }
@@ -378,17 +381,19 @@ export class App implements CommandHandlers {
         const { session } = this;
         if (!session) return;
         const { driver, source, isDriven } = session;
-        const driven = isDriven ? "A physics process drives this scene." : this.driveHint;
+        const driven = isDriven ? "A physics process controls this scene." : this.driveHint;
         this.coordinates.setCanDrive(source.features.drive && !isDriven, source.features.drive ? driven : "");
         this.coordinates.update();
+        if (!this.isPaused) this.fitColorScale(session);
         if (driver && !driver.isAnimating) this.coordinates.setAnimated(false);
-        this.updateTimeScale(isDriven);
+        this.updateTimeScale(session);
         this.status.update(session);
     }
 
     /** The panel shows every time scale, and the bar those that are at least two times slower or faster than real time. */
-    private updateTimeScale(isDriven: boolean): void {
-        const ratio = this.playback?.speed ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
+    private updateTimeScale({ driver, isDriven }: SceneSession): void {
+        const own = this.playback?.speed ?? driver?.timeScale ?? null;
+        const ratio = own ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
         this.status.timeScale = ratio;
         const isVisible = ratio !== null && (ratio <= 0.5 || ratio >= 2);
         this.bar.setTimeScale(isVisible ? format.timeScale(ratio) : "");

@@ -12,7 +12,7 @@ const MESH_BUDGET = 512e6;
 export function budgetProblem(scene: SceneDescription): string {
     const modes = modeBytes(scene) / 2;
     const limit = modeBudget();
-    if (modes > limit) return `U needs ${format.bytes(modes)} in 16 bits, and the limit is ${format.bytes(limit)}.`;
+    if (modes > limit) return `The modes need ${format.bytes(modes)}, and the limit is ${format.bytes(limit)}.`;
     const meshes = meshBytes(scene);
     if (meshes <= MESH_BUDGET) return "";
     return `The meshes need ${format.bytes(meshes)}, and the limit is ${format.bytes(MESH_BUDGET)}.`;

@@ -23,13 +23,13 @@ export class RecordingPlayer {
         if (!element?.textContent) return false;
         const text = element.textContent;
         element.remove();
-        const slow = Number(element.dataset["slow"] ?? 1);
-        this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : 1);
+        const slow = Number(element.dataset["slow"]);
+        this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : null);
         return true;
     }
 
-    /** @param slow Factor of the slow motion that is played first. */
-    private open(name: string, file: Uint8Array | (() => Uint8Array), slow = 1): void {
+    /** @param slow Factor of the slow motion that is played first; null: so that the lowest frequency is seen. */
+    private open(name: string, file: Uint8Array | (() => Uint8Array), slow: number | null = null): void {
         const { app } = this;
         this.close();
         try {
@@ -41,7 +41,7 @@ export class RecordingPlayer {
         }
     }
 
-    private play(name: string, recording: Recording, slow: number): void {
+    private play(name: string, recording: Recording, slow: number | null): void {
         const { app } = this;
         const { scene, arrays, view, isCutOff } = recording;
         const reason = app.drawingProblem(scene);
@@ -56,7 +56,7 @@ export class RecordingPlayer {
             app.notices.show("recording", text, { severity: "warn" });
         }
         const playback = new Playback(recording, model);
-        playback.speed = 1 / slow;
+        if (slow !== null) playback.speed = 1 / slow;
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);

@@ -3,9 +3,11 @@
 import { Driver } from "./control/driver";
 import { PictureView } from "./control/picture_view";
 import { PullTool } from "./control/pull";
+import { ColorScale } from "./render/color_scale";
 import { SceneRenderer } from "./render/scene_renderer";
 import type { Viewport } from "./render/viewport";
 import { norm, type Vec3 } from "./scene/affine";
+import { Deflections } from "./scene/deflection";
 import { at } from "./scene/numbers";
 import type { SceneModel } from "./scene/scene_model";
 import type { Server } from "./source/server";
@@ -33,6 +35,9 @@ export class SceneSession {
     readonly pictures: PictureView | null;
     readonly pull: PullTool | null;
     readonly driver: Driver | null;
+    /** Null without the arrays of the scene. */
+    readonly deflections: Deflections | null;
+    readonly colorScale: ColorScale;
     private hasFirstState = false;
     private lastForeignStep = -Infinity;
 
@@ -45,10 +50,15 @@ export class SceneSession {
     ) {
         const { scene, arrays } = model;
         const { server, features } = source;
+        this.deflections = arrays && new Deflections(model, arrays);
+        this.colorScale = new ColorScale(this.deflections, diagonal(model) * scene.info.unit);
         this.renderer =
             arrays && viewport.gl ? new SceneRenderer(viewport.gl, scene, arrays, viewport.isSoftware) : null;
         this.pictures = server && features.pictures ? new PictureView(server, scene.info.scene, canvas) : null;
-        this.pull = server && features.forces ? new PullTool(server, model, viewport.camera, diagonal(model)) : null;
+        this.pull =
+            server && features.forces
+                ? new PullTool(server, model, viewport.camera, diagonal(model), this.deflections)
+                : null;
         this.driver = server && features.drive ? new Driver(server, model) : null;
     }
 

@@ -4,7 +4,9 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { create } from "@bufbuild/protobuf";
 import { StepIdSchema } from "../src/proto/modalcast/v1/common_pb";
-import { TimeScale } from "../src/scene/time_scale";
+import { lowestHertz } from "../src/scene/description";
+import { slowFactor, TimeScale } from "../src/scene/time_scale";
+import { fourDomains } from "./scene";
 
 const step = (run: bigint, time: number) => create(StepIdSchema, { run, time });
 
@@ -53,4 +55,27 @@ test("there is no ratio before the first second, in a pause, or while the time s
     assert.equal(scale.ratio(now + 2000), null);
     const still = new TimeScale();
     assert.equal(still.ratio(receive(still, 1n, 0, 100)), null);
+});
+
+test("a stiff body is shown as slowly as by `modalcast view`", () => {
+    // The cases of clients/dynamics/src/slow_motion.rs.
+    const factors = [0, 0.5, 5, 5.1, 20, 206, 5000, Number.NaN].map(slowFactor);
+    assert.deepEqual(factors, [1, 1, 1, 2, 10, 100, 2000, 1]);
+    for (let hertz = 6; hertz < 20_000; hertz *= 1.01) {
+        const shown = hertz / slowFactor(hertz);
+        assert.ok(shown > 1.2 && shown < 3.2, `${hertz} Hz as ${shown} Hz`);
+    }
+});
+
+test("the lowest frequency of a scene is that of a vibration", () => {
+    const scene = fourDomains();
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    assert.equal(lowestHertz(scene), 0);
+    const [first, second] = scene.shapes;
+    assert.ok(first && second);
+    second.eigenvalues = [eigenvalue(450)];
+    assert.ok(Math.abs(lowestHertz(scene) - 450) < 1e-9);
+    // A rigid motion of the other part, with the rounding error of a solver.
+    first.eigenvalues = [1e-6, eigenvalue(735)];
+    assert.ok(Math.abs(lowestHertz(scene) - 450) < 1e-9);
 });

@@ -75,7 +75,7 @@ pub(in crate::engine) fn fit_legend(scene: &Scene, frame_output: FrameOutput, va
     let max_value = f64::from(values.iter().copied().fold(0.0, f32::max));
     let (title, requested_max, min_scale_max) = match frame_output {
         FrameOutput::ModeShape { mode, scale_max } => {
-            (format!("shape of mode {mode}, m per unit of q"), scale_max, MIN_SCALE)
+            (format!("shape of mode {}, m per unit of q", mode + 1), scale_max, MIN_SCALE)
         }
         FrameOutput::Displacement { scale_max } => (
             "displacement |u|, m".to_owned(),

@@ -4,6 +4,7 @@ import { Delivery } from "../proto/modalcast/v1/common_pb";
 import { Reason } from "../proto/modalcast/v1/errors_pb";
 import { type DriveSceneResponse, TransformFormat } from "../proto/modalcast/v1/steps_pb";
 import { TRANSFORM_SIZE } from "../scene/affine";
+import { hertzOf } from "../scene/description";
 import { Kinematics } from "../scene/kinematics";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
@@ -76,6 +77,14 @@ export class Driver {
         return this.animation !== null;
     }
 
+    /** Seconds of the animated vibration per second of real time; null without one, or if its frequency is unknown. */
+    get timeScale(): number | null {
+        if (!this.animation) return null;
+        const { domain, mode, frequency } = this.animation;
+        const hertz = hertzOf(this.model.scene, domain, mode);
+        return hertz > 0 ? frequency / hertz : null;
+    }
+
     /** Releases the writer lease. */
     dispose(): void {
         clearInterval(this.timer);
@@ -125,7 +134,7 @@ export class Driver {
             const isTaken = reason === Reason.WRITER_LEASE_TAKEN;
             this.refuse(
                 isTaken
-                    ? "Another program drives this scene. Only one program at a time may set q: stop it to use the sliders."
+                    ? "Another program controls this scene. Only one program at a time can: stop it to use the sliders."
                     : `The server rejected a step: ${field}: expected ${expected}, got ${given}.`,
             );
             return false;

@@ -1,7 +1,7 @@
 /**
  * Pulls on a point of the surface with a force that is proportional to the distance of the cursor from where the pull
  * began. The stiffness is the inverse of the point's compliance (displacement per newton), so that the point follows the
- * cursor.
+ * cursor. The force is limited to what the modes can represent, see PointCompliance.
  *
  * The force does not depend on where the point has moved. Otherwise it would close a loop through the network, whose
  * delay adds energy to modes with little damping: the vibration of a tree grew until the physics process stopped.
@@ -10,41 +10,41 @@
 import type { Hit } from "../proto/modalcast/v1/frames_pb";
 import type { OrbitCamera } from "../render/camera";
 import { norm, solveLinear, subtract, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
-import { linearNorm, restSphere } from "../scene/bounds";
+import type { Deflections } from "../scene/deflection";
 import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import type { Server, SurfaceForceMessage } from "../source/server";
-import { displacementAt, jointPoint, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
+import { type PointCompliance, pointCompliance } from "./point_compliance";
+import { deflectionAt, displacementAt, jointPoint, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
 
 /** Milliseconds between renewals of a force, and until the server removes a force that is not renewed. */
 const RENEWAL_MS = 100;
 const LIFETIME_MS = 500;
 /**
- * Distance of the cursor from the anchor, where the pull began, at which the force stops growing: in diameters of the
- * domain or, if the viewer has no arrays, in diagonals of the scene.
+ * Without eigenvalues, the viewer knows no compliance. Force in newtons at a distance of the scene's diagonal, and
+ * distance at which the force stops growing, in diagonals of the scene.
  */
-const LONGEST_PULL = 0.6;
-const LONGEST_PULL_OF_SCENE = 0.1;
-/** Force in newtons at a distance of the scene's diagonal if the description has no eigenvalues. */
 const DEFAULT_FORCE = 1000;
-/**
- * Largest eigenvalue of a mode that may be a rigid motion, as a fraction of the largest of its domain. Solvers return
- * rounding errors for these; the physics process holds such modes still, so they do not count for the compliance.
- */
-const RIGID_TOLERANCE = 1e-9;
+const LONGEST_PULL = 0.1;
 
 export interface PullView {
     from: Vec3;
     to: Vec3;
     newtons: number;
+    /** Newtons of the largest force in this direction; null if it is unknown. */
+    limit: number | null;
+    /** Whether the cursor asks for a larger force. */
+    isLimited: boolean;
+    /** Deflection of the point in meters. */
+    deflection: number;
 }
 
 export class PullTool {
     private point: SurfacePoint | null = null;
     private anchor: Vec3 = [0, 0, 0];
     private cursor: [number, number] = [0, 0];
-    private stiffness = 0;
-    private longestPull = 0;
+    /** Null without a pull, and if it is unknown. */
+    private compliance: PointCompliance | null = null;
     private isPressed = false;
     /** Number of presses, so that the pick of an earlier one is ignored. */
     private presses = 0;
@@ -64,6 +64,7 @@ export class PullTool {
         private readonly model: SceneModel,
         private readonly camera: OrbitCamera,
         private readonly diagonal: number,
+        private readonly deflections: Deflections | null,
     ) {}
 
     /** The point that the user pulls, if any. */
@@ -76,7 +77,10 @@ export class PullTool {
         if (!this.point || !this.isPressed) return null;
         const from = positionOf(this.model, this.point);
         const to = this.camera.unproject(...this.cursor, this.anchor);
-        return { from, to, newtons: norm(this.force(to)) };
+        const newtons = norm(this.force(to));
+        const limit = this.compliance?.limit(subtract(to, this.anchor)) ?? null;
+        const isLimited = limit !== null && newtons > 0.999 * limit;
+        return { from, to, newtons, limit, isLimited, deflection: deflectionAt(this.model, this.point) };
     }
 
     /** Starts a pull at a pixel of the viewport, which has `size` (width and height) pixels. */
@@ -130,8 +134,7 @@ export class PullTool {
             surfacePoint(model, hit.domain, hit.triangle, hit.barycentric) ??
             this.pointOf(hit);
         this.anchor = positionOf(this.model, this.point);
-        this.stiffness = this.stiffnessAt(this.point);
-        this.longestPull = this.longestPullOf(this.point.domain);
+        this.compliance = pointCompliance(model, this.point, this.deflections, this.diagonal);
         // The renewal follows a camera that has moved, too.
         this.timer = setInterval(() => void this.sendForces(), RENEWAL_MS);
         void this.sendForces();
@@ -150,38 +153,12 @@ export class PullTool {
         return point;
     }
 
-    /**
-     * Newtons per scene unit. The compliance of a point in direction d is the sum over all modes k of
-     * (U_k . d)^2 / eigenvalue_k. Its sum over the three axes is at least the compliance in any direction, so the point
-     * does not pass the cursor.
-     */
-    private stiffnessAt({ domain, modes }: SurfacePoint): number {
-        const { scene, layout } = this.model;
-        const description = scene.domains[domain];
-        const eigenvalues =
-            description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? 0]?.eigenvalues ?? [];
-        const rank = at(layout.ranks, domain);
-        const smallest = RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);
-        let compliance = 0;
-        for (let mode = 0; mode < Math.min(rank, eigenvalues.length); mode++) {
-            const eigenvalue = at(eigenvalues, mode);
-            if (!(eigenvalue > smallest)) continue;
-            for (let axis = 0; axis < 3; axis++) compliance += at(modes, axis * rank + mode) ** 2 / eigenvalue;
-        }
-        return compliance > 0 ? 1 / compliance : DEFAULT_FORCE / this.diagonal;
-    }
-
-    private longestPullOf(domain: number): number {
-        const shape = this.model.arrays?.shapes[this.model.scene.domains[domain]?.shape ?? -1];
-        if (!shape) return LONGEST_PULL_OF_SCENE * this.diagonal;
-        const scale = linearNorm(this.model.state.transforms, TRANSFORM_SIZE * domain);
-        return LONGEST_PULL * 2 * restSphere(shape).radius * scale;
-    }
-
     private force(to: Vec3): Vec3 {
         const offset = subtract(to, this.anchor);
-        const length = norm(offset);
-        const factor = this.stiffness * (length > this.longestPull ? this.longestPull / length : 1);
+        const stiffness = this.compliance?.stiffness ?? DEFAULT_FORCE / this.diagonal;
+        const limit = this.compliance?.limit(offset) ?? stiffness * LONGEST_PULL * this.diagonal;
+        const newtons = stiffness * norm(offset);
+        const factor = newtons > limit ? (stiffness * limit) / newtons : stiffness;
         return offset.map((component) => factor * component) as Vec3;
     }
 

@@ -1,6 +1,6 @@
 /** A point of the surface that moves with the scene. */
 
-import { applyToPoint, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
+import { applyLinear, applyToPoint, norm, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
 import { restPosition } from "../scene/arrays";
 import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
@@ -85,6 +85,12 @@ export function displacementAt(model: SceneModel, { domain, modes }: SurfacePoin
         for (let mode = 0; mode < q.length; mode++) sum += at(modes, axis * q.length + mode) * at(q, mode);
         return sum;
     }) as Vec3;
+}
+
+/** The length of A U q at the point in meters, with the linear part A of T. */
+export function deflectionAt(model: SceneModel, point: SurfacePoint): number {
+    const turned = applyLinear(model.state.transforms, TRANSFORM_SIZE * point.domain, displacementAt(model, point));
+    return norm(turned) * model.scene.info.unit;
 }
 
 /** Position of the point in the current state, in scene units relative to the scene's origin. */

@@ -60,8 +60,6 @@ export class SceneRenderer {
     private display: DomainDisplay = { hidden: new Set(), highlighted: null };
     private needsShadow = true;
     private needsDeformation = true;
-    /** The value at the bright end of the color map, in meters, or in meters per unit of q. */
-    colorScale = 0;
 
     constructor(
         private readonly renderer: THREE.WebGLRenderer,
@@ -101,6 +99,7 @@ export class SceneRenderer {
         this.surfaces.setShadows(this.options.shadows);
         this.background.define("SHADOWS", this.options.shadows);
         this.surfaces.setEdges(options.edges);
+        if (!isMap) this.surfaces.setColorMode({ kind: "shaded" });
         this.surfaces.setLinearOutput(this.needsBlending);
         for (const pass of this.backgrounds) pass.define("LINEAR_OUTPUT", this.needsBlending);
         if (!this.needsBlending) this.transparency.release();
@@ -111,7 +110,6 @@ export class SceneRenderer {
         this.background.mesh.visible = !isPlain;
         this.plain.mesh.visible = isPlain;
         this.plain.setUniform("plain", this.plainLight());
-        this.colorScale = 0;
         if (this.state) this.update(this.state);
     }
 
@@ -134,12 +132,17 @@ export class SceneRenderer {
         this.needsDeformation = true;
     }
 
+    /** @param end The value at the bright end of the color map, in meters, or in meters per unit of q. */
+    setColorScale(end: number): void {
+        if (this.options.color.kind === "shaded") return;
+        this.surfaces.setColorMode({ kind: "map", largest: end / this.scene.info.unit });
+    }
+
     private deform(state: SceneState): void {
         this.needsDeformation = false;
         this.deformer.deform(state, this.origin, this.display);
         this.spheres = domainSpheres(state, this.restSpheres, this.deformer.packed);
         this.needsShadow = true;
-        this.updateColorScale(state);
     }
 
     /** Near and far plane of a camera, so that they enclose all domains. */
@@ -353,39 +356,6 @@ export class SceneRenderer {
         this.renderer.render(this.surfaces.shadowScene, new THREE.Camera());
         this.renderer.setRenderTarget(null);
     }
-
-    private updateColorScale(state: SceneState): void {
-        const { color } = this.options;
-        if (color.kind === "shaded") {
-            this.surfaces.setColorMode({ kind: "shaded" });
-            return;
-        }
-        let largest = 0;
-        for (const domain of this.scene.domains) {
-            const packed = this.deformer.packed[domain.shape];
-            if (!packed) continue;
-            if (color.kind === "mode") largest = Math.max(largest, packed.norms[color.mode] ?? 0);
-            else {
-                const q = state.qOf(domain.domain);
-                // The largest single mode: the sum over all modes is a bound that is rarely reached.
-                packed.norms.forEach((size, mode) => {
-                    largest = Math.max(largest, size * Math.abs(at(q, mode)));
-                });
-            }
-        }
-        largest *= this.scene.info.unit;
-        // The scale grows with the values, but does not shrink, so that colors keep their meaning while a stream runs.
-        this.colorScale = Math.max(this.colorScale, niceNumber(largest));
-        this.surfaces.setColorMode({ kind: "map", largest: this.colorScale / this.scene.info.unit });
-    }
-}
-
-/** The next of 1, 2, 2.5 and 5 times a power of ten. */
-export function niceNumber(value: number): number {
-    if (!(value > 0) || !Number.isFinite(value)) return 0;
-    const power = 10 ** Math.floor(Math.log10(value));
-    const factor = [1, 2, 2.5, 5, 10].find((step) => step * power >= value * (1 - 1e-9)) ?? 10;
-    return factor * power;
 }
 
 function createShadowTarget(size: number): THREE.WebGLRenderTarget {

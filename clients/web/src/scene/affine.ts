@@ -44,6 +44,13 @@ export function applyToPoint(transform: ArrayLike<number>, offset: number, point
     return [row(0), row(1), row(2)];
 }
 
+/** The linear part times a vector. */
+export function applyLinear(transform: ArrayLike<number>, offset: number, vector: ArrayLike<number>): Vec3 {
+    const row = (r: number) =>
+        [0, 1, 2].reduce((sum, column) => sum + at(transform, offset + 4 * r + column) * at(vector, column), 0);
+    return [row(0), row(1), row(2)];
+}
+
 /** The inverse of the linear part times a vector; null if the linear part is singular. */
 export function solveLinear(transform: ArrayLike<number>, vector: Vec3): Vec3 | null {
     const [a, b, c] = [0, 1, 2].map((column) => [0, 1, 2].map((row) => at(transform, 4 * row + column)) as Vec3) as [

@@ -12,6 +12,9 @@ import { Array as ArrayKind } from "../proto/modalcast/v1/scenes_pb";
 
 export { ArrayKind };
 
+/** Largest eigenvalue of a rigid motion as a fraction of the largest of its domain. */
+const RIGID_TOLERANCE = 1e-9;
+
 export interface SceneDescription {
     info: SceneInfo;
     shapes: ShapeDescription[];
@@ -88,6 +91,43 @@ export function arrayHash(shape: ShapeDescription, kind: ArrayKind): Uint8Array 
 /** Number of modes of a domain. */
 export function rankOf(scene: SceneDescription, domain: DomainDescription): number {
     return scene.shapes[domain.shape]?.rank ?? 0;
+}
+
+/** Squared angular frequencies of a domain's modes in (rad/s)^2; empty if they are unknown. */
+export function eigenvaluesOf(scene: SceneDescription, domain: number): readonly number[] {
+    const description = scene.domains[domain];
+    return description?.eigenvalues?.values ?? scene.shapes[description?.shape ?? -1]?.eigenvalues ?? [];
+}
+
+/**
+ * Largest eigenvalue of a mode that may be a rigid motion. Solvers return rounding errors for these; the physics process
+ * holds such modes still.
+ */
+export function largestRigidEigenvalue(eigenvalues: readonly number[]): number {
+    return RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);
+}
+
+/** The lowest frequency of all vibrations in hertz; 0 if it is unknown. */
+export function lowestHertz(scene: SceneDescription): number {
+    const lowest = scene.domains.map(({ domain }) => {
+        const eigenvalues = eigenvaluesOf(scene, domain);
+        const smallest = largestRigidEigenvalue(eigenvalues);
+        return Math.min(...eigenvalues.filter((value) => value > smallest));
+    });
+    const smallest = lowest.reduce((least, value) => Math.min(least, value), Infinity);
+    return Number.isFinite(smallest) ? Math.sqrt(smallest) / (2 * Math.PI) : 0;
+}
+
+/** Frequency of a mode in hertz; 0 if it is unknown, or if the mode has no stiffness. */
+export function hertzOf(scene: SceneDescription, domain: number, mode: number): number {
+    return Math.sqrt(Math.max(0, eigenvaluesOf(scene, domain)[mode] ?? 0)) / (2 * Math.PI);
+}
+
+/** Frequency of a mode in hertz if it is the same in all domains that have the mode; otherwise 0. */
+export function commonHertz(scene: SceneDescription, mode: number): number {
+    const domains = scene.domains.filter((domain) => mode < rankOf(scene, domain));
+    const frequencies = new Set(domains.map(({ domain }) => hertzOf(scene, domain, mode)));
+    return frequencies.size === 1 ? ([...frequencies][0] ?? 0) : 0;
 }
 
 /** Bytes of U of all shapes in f32. */

@@ -1,6 +1,7 @@
 /** Measures how fast the time of a simulation passes, from the times of its steps and their arrival. */
 
 import type { StepId } from "../proto/modalcast/v1/common_pb";
+import { niceAbove, niceBelow } from "./nice_numbers";
 
 /** Steps of the last milliseconds are measured. */
 const WINDOW_MS = 10_000;
@@ -10,6 +11,21 @@ const INTERVAL_MS = 50;
 const SHORTEST_MS = 1000;
 /** After a pause of this many milliseconds the measurement begins again. */
 const LONGEST_PAUSE_MS = 1000;
+
+/** Highest frequency in hertz of a vibration that is shown without slow motion, and that at which others are shown. */
+const FASTEST_SHOWN_HERTZ = 5;
+const SLOW_HERTZ = 2;
+
+/**
+ * Real seconds per second of a vibration of `hertz` in which it is seen, as `modalcast view` selects it for a model: 1, or
+ * the nearest number 1, 2 or 5 times a power of ten.
+ */
+export function slowFactor(hertz: number): number {
+    if (!(hertz > FASTEST_SHOWN_HERTZ)) return 1;
+    const factor = hertz / SLOW_HERTZ;
+    const [lower, upper] = [niceBelow(factor), niceAbove(factor)];
+    return factor / lower < upper / factor ? lower : upper;
+}
 
 interface Arrival {
     /** Milliseconds of real time. */

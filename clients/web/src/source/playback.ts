@@ -1,12 +1,15 @@
 /** Plays a recording: delivers its messages to a scene at their times. */
 
 import { norm, type Vec3 } from "../scene/affine";
+import { lowestHertz } from "../scene/description";
 import type { SceneModel } from "../scene/scene_model";
+import { slowFactor } from "../scene/time_scale";
 import type { RecordedState, Recording } from "./recording";
 
 export class Playback {
     isPlaying = false;
-    speed = 1;
+    /** Seconds of the recording per second. At first, a vibration of the lowest frequency is seen. */
+    speed: number;
     loops = true;
     /** Seconds since the first state. */
     time = 0;
@@ -18,7 +21,9 @@ export class Playback {
     constructor(
         private readonly recording: Recording,
         private readonly model: SceneModel,
-    ) {}
+    ) {
+        this.speed = 1 / slowFactor(lowestHertz(recording.scene));
+    }
 
     get duration(): number {
         return this.recording.states.at(-1)?.time ?? 0;

@@ -62,8 +62,9 @@ export function createToolbar(handlers: CommandHandlers): Toolbar {
     ]);
 }
 
-export function listenToKeys(handlers: CommandHandlers): void {
-    const commands: Record<string, () => void> = {
+/** The commands by `KeyboardEvent.key`; letters are lower case. */
+export function keyCommands(handlers: CommandHandlers): Record<string, () => void> {
+    return {
         " ": handlers.togglePause,
         ".": () => handlers.step(1),
         ArrowRight: () => handlers.stepRecording(1),
@@ -80,6 +81,10 @@ export function listenToKeys(handlers: CommandHandlers): void {
         b: handlers.togglePanel,
         "?": handlers.toggleHelp,
     };
+}
+
+export function listenToKeys(handlers: CommandHandlers): void {
+    const commands = keyCommands(handlers);
     window.addEventListener("keydown", (event) => {
         const target = event.target as HTMLElement;
         if (event.ctrlKey || event.metaKey || event.altKey) return;

@@ -1,25 +1,23 @@
-/** The panel section with the coordinates q of one domain: bars while a program drives the scene, sliders otherwise. */
+/** The panel section with the modes of one domain: bars while a program drives the scene, sliders otherwise. */
 
-import { rankOf } from "../scene/description";
+import { type Deflections, LARGEST_DEFLECTION } from "../scene/deflection";
+import { hertzOf, rankOf } from "../scene/description";
+import { FittedRange } from "../scene/fitted_range";
+import { niceBelow } from "../scene/nice_numbers";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import { h, setText } from "./dom";
 import * as format from "./format";
-import { icon } from "./icons";
+import { ModeRow } from "./mode_row";
 
 /** Modes shown at a time. */
 const MAX_MODES = 40;
 
-/** Milliseconds after the last key press in which a slider keeps its value: the state that shows it may arrive later. */
-const INPUT_MS = 1000;
+/** The fastest animation of a mode in hertz, and that of a mode of unknown frequency. */
+const FASTEST_HERTZ = 1;
+const DEFAULT_HERTZ = 0.7;
 
-interface ModeRow {
-    value: HTMLElement;
-    bar: HTMLElement;
-    track: HTMLElement;
-    slider: HTMLInputElement;
-    play: HTMLButtonElement;
-}
+const PART = "A part of the scene has its own mesh and modes. Programs call it a domain.";
 
 export interface CoordinateHandlers {
     set(domain: number, mode: number, value: number): void;
@@ -31,14 +29,18 @@ export interface CoordinateHandlers {
 export class CoordinateSection {
     readonly element: HTMLElement;
     private model: SceneModel | null = null;
+    private deflections: Deflections | null = null;
     private domain = 0;
     private rows: ModeRow[] = [];
-    /** Value of q at the end of each slider. */
-    private ranges: number[] = [];
+    /** Meters at the ends of all bars. */
+    private barRange = new FittedRange(0);
     private animated: number | null = null;
     private canDrive = false;
-    private lastInput = -Infinity;
     private readonly select: HTMLSelectElement;
+    private readonly largest = h("output", { id: "deflection" });
+    private readonly largestRow: HTMLElement;
+    private readonly ends = [h("span"), h("span", { textContent: "0" }), h("span")] as const;
+    private readonly scale: HTMLElement;
     private readonly list = h("div", { className: "modes" });
     private readonly hint = h("p", { className: "hint" });
     private readonly reset: HTMLButtonElement;
@@ -55,23 +57,28 @@ export class CoordinateSection {
         this.row = h(
             "div",
             { className: "row" },
-            h("label", { htmlFor: "q-domain", textContent: "Domain" }),
+            h("label", { htmlFor: "q-domain", textContent: "Part", title: PART }),
             this.select,
         );
+        const label = h("label", { htmlFor: "deflection", textContent: "Deflection" });
+        this.largestRow = h("div", { className: "row" }, label, this.largest);
+        this.scale = h("div", { className: "mode-scale" }, ...this.ends);
         this.element = h(
             "div",
             { className: "body" },
             this.row,
             this.hint,
+            this.largestRow,
+            this.scale,
             this.list,
             h("div", { className: "checks" }, this.reset),
         );
     }
 
-    /** @param modeNorms Largest displacement of each mode of a domain in scene units per unit of q, if it is known. */
-    setScene(model: SceneModel | null, modeNorms: (domain: number) => ArrayLike<number> | null): void {
+    /** @param deflections Null if the viewer has no U. */
+    setScene(model: SceneModel | null, deflections: Deflections | null): void {
         this.model = model;
-        this.modeNorms = modeNorms;
+        this.deflections = deflections;
         this.animated = null;
         const domains = (model?.scene.domains ?? []).filter(
             (domain) => model && rankOf(model.scene, domain) > 0 && domain.sharesQWith === undefined,
@@ -83,33 +90,26 @@ export class CoordinateSection {
         );
         this.row.hidden = domains.length < 2;
         this.reset.hidden = domains.length === 0;
-        setText(this.hint, domains.length === 0 && model ? "No domain of this scene has modes." : "");
+        setText(this.hint, domains.length === 0 && model ? "No part of this scene has modes." : "");
         this.show(domains[0]?.domain ?? 0);
     }
 
-    /** Shows the coordinates of a domain. */
+    /** Shows the modes of a domain. */
     show(domain: number): void {
-        const { model } = this;
+        const { model, deflections } = this;
         const description = model?.scene.domains[domain];
-        if (!model || !description || rankOf(model.scene, description) === 0) {
-            this.list.replaceChildren();
-            this.rows = [];
-            return;
-        }
+        const rank = model && description ? rankOf(model.scene, description) : 0;
+        this.rows = [];
+        this.list.replaceChildren();
+        this.largestRow.hidden = this.scale.hidden = rank === 0 || !deflections;
+        if (!model || rank === 0) return;
         this.domain = at(model.layout.owner, domain);
         this.select.value = String(this.domain);
-        const eigenvalues = description.eigenvalues?.values ?? model.scene.shapes[description.shape]?.eigenvalues ?? [];
-        const norms = this.modeNorms(domain);
-        const size = this.diagonalOf(model);
-        const rank = rankOf(model.scene, description);
-        this.ranges = Array.from({ length: rank }, (_, mode) => {
-            const norm = norms ? at(norms, mode) : 0;
-            return norm > 0 ? (0.08 * size) / norm : 1;
-        });
-        this.rows = [];
-        this.list.replaceChildren(
-            ...Array.from({ length: Math.min(rank, MAX_MODES) }, (_, mode) => this.modeRow(mode, eigenvalues[mode])),
-        );
+        const size = deflections?.size(this.domain) ?? 0;
+        this.barRange = new FittedRange(size);
+        this.scale.title = `The sliders end at up to ${100 * LARGEST_DEFLECTION} % of the part's size of ${format.meters(size)}.`;
+        this.rows = Array.from({ length: Math.min(rank, MAX_MODES) }, (_, mode) => this.createRow(model, mode));
+        this.list.append(...this.rows.map((row) => row.element));
         if (rank > MAX_MODES)
             this.list.append(h("p", { className: "hint", textContent: `and ${rank - MAX_MODES} more` }));
         this.setCanDrive(this.canDrive);
@@ -119,11 +119,7 @@ export class CoordinateSection {
     /** Shows sliders if this viewer can drive the scene, otherwise bars. */
     setCanDrive(canDrive: boolean, hint = ""): void {
         this.canDrive = canDrive;
-        for (const { slider, track, play } of this.rows) {
-            slider.hidden = !canDrive;
-            track.hidden = canDrive;
-            play.disabled = !canDrive;
-        }
+        for (const row of this.rows) row.setCanDrive(canDrive);
         this.reset.disabled = !canDrive;
         if (this.rows.length > 0) setText(this.hint, hint);
         this.hint.hidden = !this.hint.textContent;
@@ -131,75 +127,63 @@ export class CoordinateSection {
 
     setAnimated(isAnimating: boolean): void {
         if (!isAnimating) this.animated = null;
-        this.rows.forEach(({ play }, mode) => {
-            const isOn = this.animated === mode;
-            if (play.getAttribute("aria-pressed") === String(isOn)) return;
-            play.setAttribute("aria-pressed", String(isOn));
-            play.replaceChildren(icon(isOn ? "pause" : "wave"));
-        });
+        for (const row of this.rows) row.setAnimated(this.animated === row.mode);
     }
 
+    /** Shows the current coordinates, unless nobody sees them. */
     update(): void {
-        const { model } = this;
-        if (!model || this.rows.length === 0) return;
+        const { model, deflections } = this;
+        if (!model || this.rows.length === 0 || !this.list.checkVisibility()) return;
         const q = model.state.qOf(this.domain);
-        this.rows.forEach(({ value, bar, slider }, mode) => {
-            const current = at(q, mode);
-            const range = Math.max(at(this.ranges, mode), Math.abs(current));
-            this.ranges[mode] = range;
-            setText(value, format.short(current));
-            bar.style.transform = `scaleX(${current / range})`;
-            const isEdited = slider.matches(":active") || performance.now() - this.lastInput < INPUT_MS;
-            if (document.activeElement !== slider || !isEdited) {
-                slider.max = String(range);
-                slider.min = String(-range);
-                slider.step = String(range / 200);
-                slider.value = String(current);
-            }
-        });
+        const largestOfModes = this.rows.reduce(
+            (largest, { mode, metersPerQ }) => Math.max(largest, Math.abs(at(q, mode)) * metersPerQ),
+            0,
+        );
+        this.barRange.update(largestOfModes, performance.now());
+        const end = this.canDrive ? Math.max(this.sliderEnd, largestOfModes) : this.barRange.end;
+        setText(this.ends[0], format.signedMeters(-end));
+        setText(this.ends[2], format.signedMeters(end));
+        for (const row of this.rows) {
+            const value = at(q, row.mode);
+            row.update(value, row.metersPerQ > 0 ? end / row.metersPerQ : Math.max(1, Math.abs(value)));
+        }
+        if (!deflections) return;
+        const isExact = deflections.isExact(this.domain);
+        const count = format.count(deflections.count(this.domain));
+        setText(this.largest, `${isExact ? "" : "about "}${format.meters(deflections.largest(this.domain))}`);
+        this.largest.title = `The largest deflection of the part, |U q|, at ${isExact ? "all" : "a selection of"} ${count} vertices.`;
     }
 
-    private modeNorms: (domain: number) => ArrayLike<number> | null = () => null;
-
-    private diagonalOf({ scene }: SceneModel): number {
-        const { bounds } = scene.info;
-        return Math.hypot(...[0, 1, 2].map((axis) => at(bounds, 3 + axis) - at(bounds, axis)));
+    /** Meters at the ends of all sliders. */
+    private get sliderEnd(): number {
+        return niceBelow(LARGEST_DEFLECTION * (this.deflections?.size(this.domain) ?? 0));
     }
 
-    private modeRow(mode: number, eigenvalue: number | undefined): HTMLElement {
-        const hertz = eigenvalue !== undefined && eigenvalue > 0 ? Math.sqrt(eigenvalue) / (2 * Math.PI) : 0;
-        const bar = h("i");
-        const track = h("div", { className: "track" }, bar);
-        const slider = h("input", { type: "range", aria: { label: `Coordinate ${mode + 1}` } });
-        slider.oninput = () => {
-            this.lastInput = performance.now();
+    private createRow(model: SceneModel, mode: number): ModeRow {
+        const hertz = hertzOf(model.scene, this.domain, mode);
+        const row = new ModeRow(mode, hertz, this.deflections?.ofMode(this.domain, mode) ?? 0);
+        row.onInput = (q) => {
             if (this.animated !== null) this.handlers.stop();
             this.animated = null;
-            this.handlers.set(this.domain, mode, Number(slider.value));
+            this.handlers.set(this.domain, mode, q);
         };
-        const play = h(
-            "button",
-            { title: "Animate this mode", aria: { label: `Animate mode ${mode + 1}`, pressed: "false" } },
-            icon("wave"),
-        );
-        play.onclick = () => {
-            const wasOn = this.animated === mode;
-            this.animated = wasOn ? null : mode;
-            if (wasOn) this.handlers.stop();
-            // Real frequencies of stiff modes are too fast to see.
-            else
-                this.handlers.animate(
-                    this.domain,
-                    mode,
-                    0.6 * at(this.ranges, mode),
-                    hertz > 0 ? Math.min(hertz, 1) : 0.7,
-                );
-            this.setAnimated(this.animated !== null);
-        };
-        const value = h("span", { className: "value" });
-        this.rows.push({ value, bar, track, slider, play });
-        const name = h("span", { className: "name", textContent: `q${mode + 1}` });
-        const frequency = h("span", { className: "name", textContent: hertz > 0 ? format.frequency(hertz) : "" });
-        return h("div", { className: "mode" }, name, frequency, h("div", {}, track, slider), value, play);
+        row.onPlay = () => this.toggleAnimation(row);
+        return row;
+    }
+
+    private toggleAnimation({ mode, hertz, metersPerQ }: ModeRow): void {
+        const wasOn = this.animated === mode;
+        this.animated = wasOn ? null : mode;
+        const amplitude = 0.6 * (metersPerQ > 0 ? this.sliderEnd / metersPerQ : 1);
+        if (wasOn) this.handlers.stop();
+        // Real frequencies of stiff modes are too fast to see.
+        else
+            this.handlers.animate(
+                this.domain,
+                mode,
+                amplitude,
+                hertz > 0 ? Math.min(hertz, FASTEST_HERTZ) : DEFAULT_HERTZ,
+            );
+        this.setAnimated(this.animated !== null);
     }
 }

@@ -23,7 +23,7 @@ export class DomainSection {
         this.filter = h("input", {
             type: "search",
             placeholder: "Filter by name",
-            aria: { label: "Filter domains by name" },
+            aria: { label: "Filter parts by name" },
         });
         this.filter.oninput = () => this.build();
         const all = h("button", { className: "outline", textContent: "Show all" });
@@ -35,7 +35,7 @@ export class DomainSection {
         const invert = h("button", {
             className: "outline",
             textContent: "Hide others",
-            title: "Hide all domains but the listed ones",
+            title: "Hide all parts but the listed ones",
         });
         invert.onclick = () => {
             const listed = new Set(this.matches());
@@ -105,7 +105,10 @@ export class DomainSection {
         const button = h("button", { textContent: name, title: `Highlight ${name}` });
         button.onclick = () => this.select(index);
         const rank = domain ? rankOf(scene, domain) : 0;
-        const meta = h("span", { className: "meta", textContent: rank > 0 ? `r = ${rank}` : "rigid" });
+        const meta = h("span", {
+            className: "meta",
+            textContent: rank > 0 ? (rank === 1 ? "1 mode" : `${rank} modes`) : "rigid",
+        });
         const row = h("div", { className: "domain", aria: { role: "listitem" } }, visible, button, meta);
         row.classList.toggle("selected", this.selected === index);
         return row;

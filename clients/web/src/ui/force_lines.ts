@@ -1,8 +1,10 @@
 /** The pull of this viewer, and the forces of others or of a recording, as lines over the picture. */
 
+import type { PullView } from "../control/pull";
 import { positionOf, surfacePoint } from "../control/surface_point";
 import type { OrbitCamera } from "../render/camera";
 import { addScaled, norm, subtract, type Vec3 } from "../scene/affine";
+import { LARGEST_DEFLECTION } from "../scene/deflection";
 import type { SceneSession } from "../session";
 import * as format from "./format";
 import { Overlay, type OverlayLine } from "./overlay";
@@ -32,7 +34,7 @@ export class ForceLines {
             if (start && end) lines.push({ from: start, to: end, text, isOwn });
         };
         const view = pull?.view;
-        if (view) add(view.from, view.to, format.newtons(view.newtons), true);
+        if (view) add(view.from, view.to, pullText(view), true);
         for (const { owner, force } of model.forces) {
             if (force?.kind.case !== "surface" || owner === pull?.ownerNumber) continue;
             const { triangle, barycentric, vector } = force.kind.value;
@@ -49,4 +51,10 @@ export class ForceLines {
         }
         this.overlay.draw(lines);
     }
+}
+
+/** The force and its limit, the deflection of the point and, at the limit, its reason. */
+function pullText({ newtons, limit, deflection, isLimited }: PullView): string {
+    const reason = isLimited ? `\nThe limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.` : "";
+    return `${format.limitedNewtons(newtons, limit)}\n${format.meters(deflection)}${reason}`;
 }

@@ -18,10 +18,22 @@ export function meters(value: number): string {
     return size < 1e4 ? `${short(value)} m` : `${short(value / 1e3)} km`;
 }
 
+/** With a sign, unless the value is 0. */
+export function signedMeters(value: number): string {
+    if (value === 0) return meters(0);
+    return `${value < 0 ? "−" : "+"}${meters(Math.abs(value))}`;
+}
+
 export function newtons(value: number): string {
     const size = Math.abs(value);
     if (size >= 1e6) return `${short(value / 1e6)} MN`;
     return size >= 1e3 ? `${short(value / 1e3)} kN` : `${short(value)} N`;
+}
+
+/** A force in newtons and the largest one at its point; null if that is unknown, infinite if nothing bends. */
+export function limitedNewtons(value: number, limit: number | null): string {
+    if (limit === null) return `${newtons(value)}, limit unknown`;
+    return Number.isFinite(limit) ? `${newtons(value)} of at most ${newtons(limit)}` : newtons(value);
 }
 
 export function frequency(hertz: number): string {
@@ -45,6 +57,11 @@ export function seconds(value: number, largest = value): string {
 export function timeScale(ratio: number): string {
     if (Math.abs(ratio - 1) < 0.05) return "real time";
     return ratio <= 0.5 ? `1/${rounded(1 / ratio)} of real time` : `${rounded(ratio)}x real time`;
+}
+
+/** A selected speed: a fraction or a multiple of real time. */
+export function speed(value: number): string {
+    return value < 1 ? `1/${short(1 / value)}` : `${short(value)}x`;
 }
 
 /** A measured number with one significant digit if the difference is at most 3 %, or else with two. */

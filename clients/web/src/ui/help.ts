@@ -10,7 +10,8 @@ const MOUSE: [string, string][] = [
     ["Two fingers", "pan and zoom"],
 ];
 
-const KEYS: [string, string][] = [
+/** Keys and their effects. Spaces separate the keys of an entry. */
+export const KEYS: [string, string][] = [
     ["Space", "play or pause"],
     [".", "show one more step"],
     ["P", "pull with the plain mouse button or a finger"],

@@ -5,11 +5,21 @@ import { byId } from "./dom";
 export interface OverlayLine {
     from: [number, number];
     to: [number, number];
+    /** Lines that are separated by "\n". */
     text: string;
     isOwn: boolean;
 }
 
 const SVG = "http://www.w3.org/2000/svg";
+
+/** Pixels between two lines of a text. */
+const LINE_HEIGHT = 17;
+
+/** Pixels between a text and the right edge of the view. */
+const MARGIN = 8;
+
+/** Pixels at the top of the view that the bar may cover: a text is then below its arrow. */
+const TOP = 60;
 
 /** Length and half width of an arrow's head in pixels. */
 const HEAD = [13, 6] as const;
@@ -20,6 +30,11 @@ export class Overlay {
     draw(lines: readonly OverlayLine[]): void {
         if (lines.length === 0 && !this.svg.firstChild) return;
         this.svg.replaceChildren(...lines.flatMap((line) => this.elements(line)));
+        const width = this.svg.clientWidth - MARGIN;
+        for (const label of this.svg.querySelectorAll("text")) {
+            const box = label.getBBox();
+            label.setAttribute("transform", `translate(${Math.min(0, width - box.x - box.width)} 0)`);
+        }
     }
 
     private elements({ from, to, text, isOwn }: OverlayLine): SVGElement[] {
@@ -34,8 +49,14 @@ export class Overlay {
         const line = create("line", { x1, y1, x2, y2, class: owner });
         const point = create("circle", { cx: x1, cy: y1, r: 5, class: owner });
         const head = create("polygon", { points: arrowHead(from, to), class: owner });
-        const label = create("text", { x: x2 + 12, y: y2 - 10 });
-        label.textContent = text;
+        const parts = text.split("\n");
+        const above = y2 - 10 - LINE_HEIGHT * (parts.length - 1);
+        const label = create("text", { y: above - LINE_HEIGHT < TOP ? y2 + 26 : above });
+        parts.forEach((part, index) => {
+            const span = create("tspan", { x: x2 + 12, dy: index > 0 ? LINE_HEIGHT : 0 });
+            span.textContent = part;
+            label.append(span);
+        });
         return [line, point, head, label];
     }
 }

@@ -4,7 +4,7 @@ import { h } from "./dom";
 import type { Notices } from "./notices";
 import type { Panel } from "./panel";
 
-const TITLE = "Remarks";
+const TITLE = "Notes on files";
 const TOPIC = "remarks";
 /** Milliseconds until the message disappears. */
 const NOTICE_MS = 12_000;
@@ -15,8 +15,8 @@ const MAX_NOTICE_LETTERS = 140;
 export function remarkNotice(remarks: readonly string[]): string {
     const [first] = remarks;
     if (first === undefined) return "";
-    if (remarks.length > 1) return `${remarks.length} remarks on the files of this scene.`;
-    return first.length <= MAX_NOTICE_LETTERS ? first : "1 remark on the files of this scene.";
+    if (remarks.length > 1) return `${remarks.length} notes on the files of this scene.`;
+    return first.length <= MAX_NOTICE_LETTERS ? first : "1 note on the files of this scene.";
 }
 
 export class RemarksSection {

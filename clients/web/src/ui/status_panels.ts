@@ -4,12 +4,14 @@ import type { SceneInfo } from "../proto/modalcast/v1/scenes_pb";
 import { meshBytes } from "../render/surfaces";
 import type { Viewport } from "../render/viewport";
 import { norm, type Vec3 } from "../scene/affine";
+import { commonHertz } from "../scene/description";
 import { at } from "../scene/numbers";
 import type { SceneSession } from "../session";
 import { h, setText } from "./dom";
 import { FactsTable } from "./facts_table";
 import * as format from "./format";
 import { Legend } from "./legend";
+import { modeName } from "./mode_row";
 import type { Panel } from "./panel";
 import { RateMeter } from "./rate_meter";
 import type { Settings } from "./settings";
@@ -45,10 +47,10 @@ export class StatusPanels {
             .join(" x ");
         this.scene.set({
             Source: info.source,
-            Domains: format.count(info.domains),
+            Parts: format.count(info.domains),
             Vertices: format.count(info.vertices),
             Triangles: format.count(info.triangles),
-            Coordinates: format.count(info.coordinates),
+            Modes: format.count(info.coordinates),
             Size: `${size} m`,
             Unit: unit === 1 ? null : `${format.short(unit)} m`,
             "Up axis": info.up,
@@ -77,7 +79,7 @@ export class StatusPanels {
             ),
             "Round trip": source.server ? `${this.latency.toFixed(1)} ms` : null,
             "Error of this view": this.errorText({ model, renderer }),
-            "Storage of U": renderer && model.layout.coordinates > 0 ? storage : null,
+            "Storage of modes": renderer && model.layout.coordinates > 0 ? storage : null,
             "Graphics memory": renderer ? format.bytes(renderer.deformer.bytes + meshBytes(model.scene)) : null,
             Step: step ? `${step.number} at ${format.seconds(step.time)}` : "rest state",
             "Time scale": this.timeScale === null ? null : format.timeScale(this.timeScale),
@@ -99,12 +101,12 @@ export class StatusPanels {
         return `at most ${format.meters(renderer.errorBound())}`;
     }
 
-    private updateLegend({ renderer }: SceneSession): void {
+    private updateLegend({ renderer, colorScale, model }: SceneSession): void {
         const { color, pictures } = this.settings;
         if (pictures || color.kind === "shaded" || !renderer) return this.legend.hide();
-        const title = color.kind === "mode" ? `Mode ${color.mode + 1}, per unit of q` : "Displacement";
-        const scale = renderer.colorScale;
-        this.legend.show(title, color.kind === "mode" ? `${format.short(scale)} m` : format.meters(scale));
+        if (color.kind === "displacement") return this.legend.show("Deflection", format.meters(colorScale.end));
+        const name = modeName(color.mode, commonHertz(model.scene, color.mode));
+        this.legend.show(`${name}: part of its largest deflection`, "100 %");
     }
 
     private updateForces({ model, pull, source }: SceneSession): void {
@@ -114,9 +116,12 @@ export class StatusPanels {
             return;
         }
         const text = model.forces.map(({ owner, force }) => {
+            const isOwn = owner === pull?.ownerNumber;
+            const newtons = force?.kind.case === "surface" ? norm(force.kind.value.vector as Vec3) : null;
+            const limit = (isOwn ? pull?.view?.limit : undefined) ?? null;
             const size =
-                force?.kind.case === "surface" ? format.newtons(norm(force.kind.value.vector as Vec3)) : "modal";
-            const who = owner === pull?.ownerNumber ? "you" : `viewer ${owner}`;
+                newtons === null ? "modal" : isOwn ? format.limitedNewtons(newtons, limit) : format.newtons(newtons);
+            const who = isOwn ? "you" : `viewer ${owner}`;
             return `${who}: ${size} on ${model.scene.domains[force?.domain ?? 0]?.name ?? "?"}`;
         });
         setText(this.forces, text.join("\n"));

@@ -37,7 +37,7 @@ export class Timeline {
             ...speeds.map((value) =>
                 h("option", {
                     value: String(value),
-                    textContent: `${format.short(value)}x`,
+                    textContent: format.speed(value),
                     selected: value === playback.speed,
                 }),
             ),

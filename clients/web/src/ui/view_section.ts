@@ -23,7 +23,7 @@ export class ViewSection {
     constructor(private readonly settings: Settings) {
         this.local = h("button", {
             textContent: "Browser",
-            title: "Load the mesh and U once, then receive only q and T",
+            title: "Load the mesh and the modes once, then receive only the motion",
         });
         this.server = h("button", { textContent: "Server", title: "Show the pictures that the server draws" });
         this.local.onclick = () => this.set(() => (settings.pictures = false));
@@ -38,8 +38,8 @@ export class ViewSection {
             "select",
             { id: "color" },
             h("option", { value: "shaded", textContent: "Materials" }),
-            h("option", { value: "displacement", textContent: "Displacement" }),
-            h("option", { value: "mode", textContent: "One mode" }),
+            h("option", { value: "displacement", textContent: "Deflection" }),
+            h("option", { value: "mode", textContent: "Shape of a mode" }),
         );
         this.mode = h("input", { id: "mode", type: "number", min: "1", value: "1", step: "1" });
         this.color.onchange = () => this.set(() => this.readColor());
@@ -115,9 +115,10 @@ export class ViewSection {
         this.refresh();
     }
 
-    /** Shows a color map that was chosen elsewhere. */
-    showColor(): void {
-        this.color.value = this.settings.color.kind;
+    /** Selects the next color map, without `onChange`. */
+    nextColor(): void {
+        this.color.selectedIndex = (this.color.selectedIndex + 1) % this.color.options.length;
+        this.readColor();
     }
 
     refresh(): void {

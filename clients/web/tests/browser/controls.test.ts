@@ -34,19 +34,18 @@ function shownQ(page: Page): Promise<number> {
 
 test("sliders and animated modes drive a scene that nobody else drives", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
-    const slider = page.getByRole("slider", { name: "Coordinate 1", exact: true });
+    const slider = page.getByRole("slider", { name: "Mode 1", exact: true });
     await slider.waitFor();
     await slider.focus();
     for (let press = 0; press < 10; press++) await page.keyboard.press("ArrowRight");
-    // The value of the slider is rounded to its step.
-    await page.waitForFunction(
-        (input) => {
-            const { value, step } = input as HTMLInputElement;
-            const q = modalcastViewer.model?.state.q[0] ?? 0;
-            return Number(value) > 5 * Number(step) && Math.abs(q - Number(value)) <= Number(step);
-        },
-        await slider.elementHandle(),
-    );
+    // The trunk has a size of 6.8 m, so the sliders end at 0.5 m, and a press is a step of 2.5 mm.
+    await page.getByText("−500 mm0+500 mm").waitFor();
+    await page
+        .locator(".mode .value", { hasText: /^\+25 mm$/ })
+        .first()
+        .waitFor();
+    assert.equal(await slider.inputValue(), "10");
+    await page.locator("#deflection", { hasText: /^25 mm$/ }).waitFor();
     const value = await shownQ(page);
     assert.ok(value > 0, `expected a positive value, got ${value}`);
     assert.equal(await serverQ(), value);
@@ -70,7 +69,7 @@ test("sliders and animated modes drive a scene that nobody else drives", { timeo
         if (simulation.exitCode !== null) simulation = startSimulation(server, ["--scene", "tree"]);
     }
     await slider.waitFor({ state: "hidden" });
-    assert.ok(await page.getByText("A physics process drives this scene.").isVisible());
+    assert.ok(await page.getByText("A physics process controls this scene.").isVisible());
     await end(simulation);
     await slider.waitFor();
     assert.deepEqual(errors, []);
@@ -80,18 +79,21 @@ test("sliders and animated modes drive a scene that nobody else drives", { timeo
 test("keys switch edges, shadows, colors, panels, the pull tool and help", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await setup.openTree(WIDTH, HEIGHT);
     await rememberSettledPixels(page);
-    for (const [key, name] of [
-        ["e", "edges"],
-        ["s", "shadows"],
-        ["m", "a color map"],
+    for (const [key, name, legends] of [
+        ["e", "edges", [null]],
+        ["s", "shadows", [null]],
+        ["m", "a color map", [/^Deflection0/, /^Mode 1.*100 %$/]],
     ] as const) {
-        await page.keyboard.press(key);
-        const changed = await changedValues(page);
-        assert.ok(changed > 500, `expected other pixels with ${name} switched, got ${changed}`);
-        if (key === "m") assert.ok(await page.locator("#legend").isVisible());
+        for (const legend of legends) {
+            await page.keyboard.press(key);
+            const changed = await changedValues(page);
+            assert.ok(changed > 500, `expected other pixels with ${name} switched, got ${changed}`);
+            if (legend) await page.locator("#legend").filter({ hasText: legend }).waitFor();
+        }
         await page.keyboard.press(key);
         assert.equal(await changedValues(page), 0, `expected the same pixels without ${name}`);
     }
+    await page.locator("#legend").waitFor({ state: "hidden" });
     await page.keyboard.press("b");
     await page.locator("#panel").waitFor({ state: "hidden" });
     await page.keyboard.press("b");
@@ -103,8 +105,18 @@ test("keys switch edges, shadows, colors, panels, the pull tool and help", { tim
     await page.locator("#help").waitFor();
     await page.keyboard.press("Escape");
     await page.locator("#help").waitFor({ state: "hidden" });
+    // The page has one word for each thing: part, note, control, deflection.
+    const titles = await page.evaluate(() =>
+        [...document.querySelectorAll("[title], [aria-label]")].map(
+            (element) => `${element.getAttribute("title")} ${element.getAttribute("aria-label")}`,
+        ),
+    );
+    const panels = (await page.locator("#panel").textContent()) ?? "";
+    assert.match(panels, /Modes.*Deflection.*Parts/s);
+    for (const text of [...titles, panels])
+        assert.doesNotMatch(text.replace("Programs call it a domain.", ""), /domain|remark|lease|displacement/i);
     // Control: letters in a text field are text.
-    await page.locator("summary", { hasText: "Domains" }).click();
+    await page.locator("summary", { hasText: "Parts" }).click();
     const filter = page.getByRole("searchbox");
     await filter.pressSequentially("branch-1");
     assert.equal(await filter.inputValue(), "branch-1");

@@ -37,7 +37,7 @@ async function useViewer(page: Page): Promise<void> {
     await page.mouse.down();
     await page.mouse.move(WIDTH / 2, HEIGHT / 2, { steps: 10 });
     await page.mouse.up();
-    for (const key of ["v", "v", "m", "m", "e", "e", "s", "s", "b", "b"]) {
+    for (const key of ["v", "v", "m", "m", "m", "e", "e", "s", "s", "b", "b"]) {
         await page.keyboard.press(key);
         await page.waitForTimeout(150);
     }

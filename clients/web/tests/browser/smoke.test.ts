@@ -268,11 +268,15 @@ test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, a
         await page.waitForFunction(() => modalcastViewer.pull?.view != null);
         const start = await pulledPoint(page);
         await page.mouse.move(x + 90, y - 30, { steps: 5 });
+        // The limit of the force lets the tip of a leaf of 0.7 m move by 0.07 m.
         await page.waitForFunction((from) => {
             const now = modalcastViewer.pull?.view?.from ?? from;
-            return Math.hypot(...now.map((value, axis) => value - (from[axis] ?? 0))) > 0.05;
+            return Math.hypot(...now.map((value, axis) => value - (from[axis] ?? 0))) > 0.005;
         }, start);
-        assert.match(await page.locator("#overlay text").first().innerHTML(), /N$/);
+        assert.match(
+            (await page.locator("#overlay tspan").first().textContent()) ?? "",
+            /^[\d.]+ N of at most [\d.]+ N$/,
+        );
         await page.evaluate(() => {
             globalThis.watchedPoint = modalcastViewer.pull?.grabbed ?? null;
         });

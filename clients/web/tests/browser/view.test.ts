@@ -7,10 +7,12 @@ import { join } from "node:path";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
 import {
+    dropFiles,
     end,
     launchBrowser,
     openPage,
     printedUrl,
+    runProgram,
     startProgram,
     takeScreenshot,
     temporaryFolder,
@@ -36,6 +38,7 @@ after(async () => {
 /** `modalcast view` of a model file, and its page. */
 interface View extends ViewerPage {
     program: ChildProcess;
+    url: string;
 }
 
 async function view(name: string, content: Buffer | string, modeling: string[] = []): Promise<View> {
@@ -47,7 +50,7 @@ async function view(name: string, content: Buffer | string, modeling: string[] =
     const url = await printedUrl(program, "open");
     const viewerPage = await openPage(browser, url, WIDTH, HEIGHT);
     await waitForScene(viewerPage.page);
-    return { ...viewerPage, program };
+    return { ...viewerPage, program, url };
 }
 
 async function close({ page, errors, program }: View): Promise<void> {
@@ -88,6 +91,55 @@ function upperPixel(page: Page): Promise<[number, number]> {
     });
 }
 
+/** The color map of deflections ends at a round number that is at most 5 / 2 times the largest recent deflection. */
+async function checkColorRange(page: Page): Promise<void> {
+    await page.keyboard.press("m");
+    const legend = page.locator("#legend .ends span").nth(1);
+    await legend.filter({ hasText: / m/ }).waitFor();
+    const scale = await page.evaluate(() => {
+        const { deflections, colorScale } = modalcastViewer.session ?? {};
+        return { end: colorScale?.end ?? 0, largest: deflections?.largestOfScene() ?? 0 };
+    });
+    assert.ok(scale.end >= scale.largest && scale.end < 0.1, JSON.stringify(scale));
+    assert.match((await legend.textContent()) ?? "", /^[125]0{0,2} mm$/);
+    await page.keyboard.press("m");
+    await page.locator("#legend", { hasText: "Mode 1, 1 Hz: part of its largest deflection" }).waitFor();
+    await page.keyboard.press("m");
+    await page.locator("#legend").waitFor({ state: "hidden" });
+}
+
+/** Pulls the beam from a pixel, farther than it may bend: by a tenth of its length of 1 m. */
+async function checkForceLimit(page: Page, [x, y]: [number, number]): Promise<void> {
+    const text = (line: number) => page.locator("#overlay tspan").nth(line).textContent();
+    const view = () => page.evaluate(() => modalcastViewer.pull?.view);
+    await page.mouse.move(x + 20, y);
+    await page.waitForFunction(() => modalcastViewer.pull?.view?.isLimited === false);
+    assert.match((await text(0)) ?? "", /^[\d.]+ N of at most [\d.]+ N$/);
+    await page.mouse.move(x + 300, y);
+    await page.waitForFunction(() => modalcastViewer.pull?.view?.isLimited);
+    const pull = await view();
+    const [newtons, limit] = [pull?.newtons ?? 0, pull?.limit ?? 0];
+    assert.ok(Math.abs(newtons / limit - 1) < 1e-9, `expected ${limit} N, got ${newtons} N`);
+    assert.match((await text(1)) ?? "", /mm$/);
+    assert.equal(await text(2), "The limit bends the part by 10 % of its size.");
+    const [label, stage] = await page.evaluate(() =>
+        ["#overlay text", "#stage"].map(
+            (selector) => document.querySelector(selector)?.getBoundingClientRect().right ?? 0,
+        ),
+    );
+    assert.ok(label && stage && label < stage, `expected the text left of ${stage}, got ${label}`);
+    // q = f U_i / eigenvalue, and |q| is the deflection of the free end.
+    const point = await page.evaluate(() => [...(modalcastViewer.pull?.grabbed?.modes ?? [])]);
+    const [x0 = 0, , , y1 = 0] = point;
+    const direction = (pull?.to ?? []).map((value, axis) => value - (pull?.from[axis] ?? 0));
+    const length = Math.hypot(...direction);
+    const [fx = 0, fy = 0] = direction.map((component) => ((pull?.newtons ?? 0) * component) / length);
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const deflection = Math.hypot((x0 * fx) / eigenvalue(1), (y1 * fy) / eigenvalue(1.5));
+    assert.ok(deflection > 0.09 && deflection < 0.12, `expected 0.1 m at the free end, got ${deflection}`);
+    await page.getByText(/^you: [\d.]+ N of at most [\d.]+ N on beam$/).waitFor({ state: "attached" });
+}
+
 function coordinates(page: Page): Promise<number[]> {
     return page.evaluate(() => [...(modalcastViewer.model?.state.q ?? [])]);
 }
@@ -120,6 +172,7 @@ test("a one-part archive with eigenvalues is pulled, moves and rings down", { ti
     await page.waitForTimeout(500);
     await takeScreenshot(page, "view-npz-pulled");
     const pulled = await coordinates(page);
+    await checkForceLimit(page, [x, y]);
     await page.mouse.up();
     await page.keyboard.up("Shift");
     // It swings to the other side, and comes to rest.
@@ -129,6 +182,7 @@ test("a one-part archive with eigenvalues is pulled, moves and rings down", { ti
     }, pulled);
     let norm = Math.hypot(...pulled);
     while (norm > 0.2 * Math.hypot(...pulled)) norm = await largestNorm(page, 1200);
+    await checkColorRange(page);
     assert.equal(await page.locator(".notice").count(), 0);
     // The page learns that the physics process has ended.
     const physics = children(program)["modalcast-sim"];
@@ -172,7 +226,7 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     const triangle = "mtllib absent.mtl\nv 0 0 0\nv 200 0 0\nv 0 200 0\nf 1 2 3\n";
     const shown = await view("triangle.obj", triangle, ["--no-sim"]);
     const { page } = shown;
-    const notice = page.locator(".notice", { hasText: "2 remarks on the files of this scene." });
+    const notice = page.locator(".notice", { hasText: "2 notes on the files of this scene." });
     await notice.getByRole("button", { name: "Show" }).click();
     await notice.waitFor({ state: "hidden" });
     const remarks = await page.locator("ul.remarks li").allTextContents();
@@ -184,7 +238,7 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     await close(shown);
     const plain = await view("triangle.obj", triangle.replace("mtllib absent.mtl\n", ""), ["--no-sim", "--unit", "mm"]);
     assert.equal(await plain.page.locator(".notice").count(), 0, "control");
-    assert.equal(await plain.page.locator("summary", { hasText: "Remarks" }).isVisible(), false, "control");
+    assert.equal(await plain.page.locator("summary", { hasText: "Notes on files" }).isVisible(), false, "control");
     await close(plain);
 });
 
@@ -208,6 +262,60 @@ test("a stiff body is shown in slow motion, which the page names", { timeout: LI
         await takeScreenshot(page, `view-slow-${options[1] ?? "default"}`);
         await close(shown);
     }
+});
+
+test("a recording of a stiff body that is dropped onto the page plays in slow motion", {
+    timeout: LIMIT_MS,
+}, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    for (const [hertz, text] of [
+        [450, "1/200 of real time"],
+        [3, null],
+    ] as const) {
+        const shown = await view("fork.npz", new Beam().npz([eigenvalue(hertz), eigenvalue(600)]));
+        const { page } = shown;
+        const file = join(temporaryFolder(), "fork.mcap");
+        const server = new URL(shown.url).origin;
+        await runProgram("modalcast-record", ["record", "fork", "--out", file, "--server", server, "--steps", "30"]);
+        await dropFiles(page, { "fork.mcap": readFileSync(file) });
+        await page.getByRole("slider", { name: "Time in seconds" }).waitFor();
+        const speed = await page.getByRole("combobox", { name: "Speed" }).inputValue();
+        assert.equal(Number(speed), text ? 1 / 200 : 1);
+        const bar = page.locator("#time-scale");
+        if (text) await bar.filter({ hasText: text }).waitFor();
+        else assert.equal(await bar.isVisible(), false, "control");
+        await takeScreenshot(page, `view-recording-${hertz}-hertz`);
+        await close(shown);
+    }
+});
+
+test("an animated mode of a stiff body is slowed down, and the page says by which factor", {
+    timeout: LIMIT_MS,
+}, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("fork.npz", new Beam().npz([eigenvalue(450), eigenvalue(600)]), ["--no-sim"]);
+    const { page } = shown;
+    const bar = page.locator("#time-scale");
+    assert.equal(await bar.isVisible(), false, "control: nothing moves");
+    await page.getByText("Mode 1, 450 Hz").waitFor();
+    // The beam has a size of 1.01 m. The end turns, too, so a corner moves by 1.007 m per unit of q.
+    assert.equal(await page.locator(".mode-scale").textContent(), "−100 mm0+100 mm");
+    await page.getByRole("button", { name: "Animate mode 1", exact: true }).click();
+    await bar.filter({ hasText: "1/450 of real time" }).waitFor();
+    await page.waitForFunction(() => (modalcastViewer.model?.state.q[0] ?? 0) > 0.03);
+    await takeScreenshot(page, "view-animated-mode");
+    await page.getByRole("button", { name: "Animate mode 1", exact: true }).click();
+    await bar.waitFor({ state: "hidden" });
+    await page.getByRole("slider", { name: "Mode 2", exact: true }).focus();
+    await page.keyboard.press("End");
+    await page.locator("#deflection", { hasText: /^100 mm$/ }).waitFor();
+    assert.equal(await page.locator(".mode .value").nth(1).textContent(), "+100 mm");
+    assert.equal(
+        await page.locator(".mode .value").nth(1).getAttribute("title"),
+        "q[1] = 0.0993, counted from 0 as in programs",
+    );
+    await takeScreenshot(page, "view-slider");
+    await close(shown);
 });
 
 for (const [name, content, reason] of [
