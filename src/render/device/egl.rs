@@ -243,6 +243,8 @@ impl Context {
         let instance = &api()?.instance;
         let display = candidate.display;
         let to_fault = fault_in::<egl::Error>("EGL context");
+        #[cfg(test)]
+        testing::wait_for_other_tests();
         let _lock = lock_contexts();
         instance.initialize(display).map_err(fault_in("EGL initialize"))?;
         let extensions = instance.query_string(Some(display), egl::EXTENSIONS).map_err(&to_fault)?.to_string_lossy();
@@ -348,6 +350,23 @@ pub(crate) mod testing {
     use std::thread::JoinHandle;
 
     use super::*;
+
+    /// Held by the thread of the test that draws.
+    static DRAWING: Mutex<()> = Mutex::new(());
+
+    thread_local! {
+        /// Released when the thread ends.
+        static TURN: RefCell<Option<MutexGuard<'static, ()>>> = const { RefCell::new(None) };
+    }
+
+    /// Lets one test at a time draw, as the server does on one thread. Mesa's software renderer shares its threads
+    /// between all contexts of a process, and has crashed while two tests drew. Each test has a thread of its own.
+    pub(super) fn wait_for_other_tests() {
+        TURN.with_borrow_mut(|turn| {
+            // A test that failed leaves the lock poisoned.
+            turn.get_or_insert_with(|| DRAWING.lock().unwrap_or_else(PoisonError::into_inner));
+        });
+    }
 
     /// Keeps a context current on another thread, so that EGL cannot make it current on this thread.
     pub(crate) struct OccupiedContext {
