@@ -29,5 +29,5 @@ void main() {
     // Samples whose alpha reaches the threshold `diffuse.a` were already drawn as opaque.
     keep_uncovered_samples(material.ambient.a * tint.a, material.diffuse.a);
 #endif
-    color = vec4(phong(material, tint.rgb, normal, world, ShadowReceiver(world, geometric_normal)), material.ambient.a * tint.a);
+    color = vec4(phong(material, tint.rgb, normal, world, ShadowReceiver(world, geometric_normal), 1.0), material.ambient.a * tint.a);
 }

@@ -45,7 +45,14 @@ vec3 shade_id(uint id, vec2 ndc, vec2 pixel_size) {
     vec3 direction = view_ray(ndc);
     vec3 light = sky(direction);
 #ifdef HAS_GROUND
-    if (id == GROUND_ID) light = shade_ground(frame.eye.xyz + ground_ray_depth(direction) * direction);
+    if (id == GROUND_ID) {
+        vec3 world = frame.eye.xyz + ground_ray_depth(direction) * direction;
+        float ambient_visibility = 1.0;
+#ifdef AMBIENT_OCCLUSION
+        if (is_near_surfaces(world)) ambient_visibility = ambient_visibility_of(world, frame.up.xyz, ndc);
+#endif
+        light = shade_ground(world, ambient_visibility);
+    }
 #endif
 #ifndef BACKGROUND
     if (id != NO_ID && id != GROUND_ID) light = shade_triangle(int(id - 1u), ndc, pixel_size).rgb;

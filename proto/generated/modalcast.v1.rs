@@ -343,6 +343,19 @@ pub struct Lighting {
     pub exposure: f32,
     #[prost(enumeration = "ToneMapping", tag = "9")]
     pub tone_mapping: i32,
+    /// Ambient cube: the colors of the sides +x, -x, +y, -y, +z and -z in world axes, 18 numbers. A surface with the unit
+    /// normal n receives the sum over the axes of n_i^2 times the color of the side to which n_i points, in place of
+    /// `skylight`. Empty if the ambient light is `skylight` for every normal.
+    #[prost(float, repeated, tag = "10")]
+    pub ambient_cube: ::prost::alloc::vec::Vec<f32>,
+    /// Fill light at the camera, which casts no shadow. Its product with the cosine between the normal and the direction
+    /// to the eye is added to the diffuse light. Empty if there is none.
+    #[prost(float, repeated, tag = "11")]
+    pub fill: ::prost::alloc::vec::Vec<f32>,
+    /// Radius of the ambient occlusion as a fraction of the diagonal of `SceneInfo.bounds`; unset if there is none. An
+    /// occluder at the distance d blocks 1 - (d / radius)^2 of the ambient light from its direction.
+    #[prost(float, optional, tag = "12")]
+    pub ambient_occlusion_radius: ::core::option::Option<f32>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct UploadSceneRequest {
@@ -464,7 +477,7 @@ pub struct UploadedDomain {
     /// identity. f32 rounds the place of a domain that is far from the scene's origin.
     #[prost(bytes = "bytes", tag = "6")]
     pub placement: ::prost::bytes::Bytes,
-    /// Diffuse color: linear red, green and blue, 0 to 1; empty: 0.65, 0.4, 0.22.
+    /// Diffuse color: linear red, green and blue, 0 to 1; empty: 0.19, 0.31, 0.47.
     #[prost(float, repeated, tag = "7")]
     pub color: ::prost::alloc::vec::Vec<f32>,
     /// Squared angular frequencies in (rad/s)^2, one per mode; empty if unknown.

@@ -1,10 +1,10 @@
-// Phong shading (equation 3.12) with clamped dot products and unshadowed ambient light:
-//   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e,
-// with v_l to the sun, v_e to the eye, s_f the sun visibility, and the ambient, diffuse and specular colors Ca, Cd and
-// Cs. In the thesis v_e points away from the eye, which would put the highlight on the far side of the surface. If the
-// material has a color image, its texel multiplies Ca and Cd (equation 3.14, whose printed s_tex is inverted).
-vec3 safe_normalize(vec3 v) { return v * inversesqrt(max(dot(v, v), 1e-30)); }
-
+// Phong shading (equation 3.12) with clamped dot products:
+//   C = s_a ambient Ca + fill (n . v_e) Cd + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),
+//   v_e' = 2 (v_e . n) n - v_e,
+// with v_l to the sun, v_e to the eye, s_a the ambient visibility, s_f the sun visibility, and the ambient, diffuse and
+// specular colors Ca, Cd and Cs. In the thesis v_e points away from the eye, which would put the highlight on the far
+// side of the surface. If the material has a color image, its texel multiplies Ca and Cd (equation 3.14, whose printed
+// s_tex is inverted). Outdoors, the ambient light is the skylight and there is no fill light.
 #ifdef NORMAL_MAPS
 // Perturbs a unit normal by a texel of a normal map. `raw_tangent`: interpolated direction of u, with the sign of the
 // bitangent in w. If it is 0, the normal does not change.
@@ -23,12 +23,19 @@ struct ShadowReceiver {
     vec3 normal;
 };
 
-vec3 phong(Material material, vec3 tint, vec3 normal, vec3 world, ShadowReceiver receiver) {
+vec3 phong(Material material, vec3 tint, vec3 normal, vec3 world, ShadowReceiver receiver, float ambient_visibility) {
     vec3 to_sun = frame.to_sun.xyz;
-    vec3 light = frame.skylight.rgb * material.ambient.rgb * tint;
+    vec3 light = ambient_visibility * ambient_light(normal) * material.ambient.rgb * tint;
+#ifdef STUDIO
+    vec3 to_eye = safe_normalize(frame.eye.xyz - world);
+    float facing = dot(normal, to_eye);
+    if (facing > 0.0) light += facing * FILL * material.diffuse.rgb * tint;
+#endif
     float cosine = dot(normal, to_sun);
     if (cosine > 0.0) {
+#ifndef STUDIO
         vec3 to_eye = safe_normalize(frame.eye.xyz - world);
+#endif
         vec3 reflected = 2.0 * dot(to_eye, normal) * normal - to_eye;
         float highlight_cosine = dot(reflected, to_sun);
         float highlight = highlight_cosine > 0.0 ? pow(highlight_cosine, material.specular.a) : 0.0;

@@ -8,6 +8,12 @@ layout(binding = 20) uniform samplerBuffer tangents;
 
 vec2 finite_or_zero(vec2 slope) { return any(isnan(slope)) || any(isinf(slope)) ? vec2(0.0) : slope; }
 
+// Unit normal of the plane of a triangle; 0 if its area is 0.
+vec3 face_normal(Triangle triangle) {
+    vec3 edge = safe_normalize(triangle.world[1] - triangle.world[0]);
+    return safe_normalize(cross(edge, safe_normalize(triangle.world[2] - triangle.world[0])));
+}
+
 // The receiver of shadows at a point of a triangle. `normal` is the interpolated normal. `facing` is 1 if the front
 // side is visible, else -1.
 //
@@ -23,8 +29,7 @@ ShadowReceiver shadow_receiver(Triangle triangle, vec3 weights, vec3 world, vec3
 #ifdef SHADOWS
     // Cosine of the angle between the sun and the triangle's normal above which the triangle faces the sun.
     const float FACING_COSINE = 0.25;
-    vec3 edge = safe_normalize(triangle.world[1] - triangle.world[0]);
-    vec3 face = safe_normalize(cross(edge, safe_normalize(triangle.world[2] - triangle.world[0])));
+    vec3 face = face_normal(triangle);
     face *= dot(face, normal) < 0.0 ? -1.0 : 1.0;
     float smoothness = clamp(1.0 - facing * dot(face, frame.to_sun.xyz) / FACING_COSINE, 0.0, 1.0);
     vec3 offset = vec3(0.0);
@@ -64,7 +69,11 @@ vec4 shade_triangle(int triangle_index, vec2 ndc, vec2 pixel_size) {
     shading_normal *= facing;
     vec3 world = triangle.world * bary.weights;
     ShadowReceiver receiver = shadow_receiver(triangle, bary.weights, world, geometric_normal, facing);
-    vec3 light = phong(material, tint.rgb, shading_normal, world, receiver);
+    float ambient_visibility = 1.0;
+#ifdef AMBIENT_OCCLUSION
+    ambient_visibility = ambient_visibility_of(world, face_normal(triangle), ndc);
+#endif
+    vec3 light = phong(material, tint.rgb, shading_normal, world, receiver, ambient_visibility);
 #ifdef MESH_EDGES
     light = mix(light, frame.edges.rgb, edge_coverage(triangle, triangle_index, pixel_size));
 #endif

@@ -2,9 +2,9 @@
 //! them, so that an option means the same everywhere.
 
 use modalcast_model::load::LoadOptions;
-use modalcast_model::scene::{LengthUnit, UpAxis};
+use modalcast_model::scene::{LengthUnit, Lighting, UpAxis};
 
-/// Unit, up axis and strictness.
+/// Unit, up axis, lighting and strictness.
 #[derive(Debug, Clone, Copy, Default, PartialEq, clap::Args)]
 pub(crate) struct LoadingOptions {
     /// Unit of the lengths in the file: m, mm, cm, um, in, ft, or a number of meters. Replaces the key `unit` of
@@ -15,6 +15,10 @@ pub(crate) struct LoadingOptions {
     /// format].
     #[arg(long, value_name = "AXIS")]
     pub(crate) up: Option<UpAxis>,
+    /// Lights and background: outdoor (sun, sky and ground) or studio. Replaces the key `look.lighting` of scene.toml
+    /// [default: studio for models without materials of their own, else outdoor].
+    #[arg(long, value_name = "NAME")]
+    pub(crate) lighting: Option<Lighting>,
     /// Treat missing material libraries, materials and images, images of unsupported formats, and values out of range,
     /// not finite or not understood, as errors instead of remarks.
     #[arg(long)]
@@ -24,10 +28,10 @@ pub(crate) struct LoadingOptions {
 impl LoadingOptions {
     /// The options of the loaders.
     pub(crate) fn load_options(&self) -> LoadOptions {
-        LoadOptions { is_strict: self.strict, unit: self.unit, up: self.up }
+        LoadOptions { is_strict: self.strict, unit: self.unit, up: self.up, lighting: self.lighting }
     }
 
-    /// The flags of the options that are given.
+    /// The flags of the options that are given and that the modes depend on.
     #[allow(dead_code, reason = "modalcast-modes starts no program")]
     pub(crate) fn arguments(&self) -> Vec<String> {
         let unit = self.unit.map(|unit| format!("--unit={unit}"));
@@ -64,6 +68,7 @@ mod tests {
             assert_eq!(options.arguments(), flags);
             assert_eq!(parse(flags).expect("valid options"), options);
         }
+        assert!(parse(&["--lighting", "outdoor"]).expect("valid options").arguments().is_empty());
         let options = parse(&["--unit", "in", "--up", "x"]).expect("valid options").load_options();
         let unit = options.unit.expect("a unit").meters();
         assert_eq!((unit, options.up, options.is_strict), (0.0254, Some(UpAxis::X), false));
@@ -75,6 +80,7 @@ mod tests {
             (["--unit", "yard"], "expected m, mm, cm"),
             (["--unit", "0"], "1e-12 to 1e12"),
             (["--up", "w"], "x, y or z"),
+            (["--lighting", "garage"], "outdoor or studio"),
         ] {
             let message = parse(&words).expect_err("an error").to_string();
             assert!(message.contains(expected), "{message}");

@@ -148,7 +148,7 @@ pub(super) fn run(args: &Args) -> Outcome {
     let result = match recording::is_recording(&args.model) {
         true if args.modeling.is_requested() => Err(invalid("options of modes", "a surface", "a recording")),
         true if args.loading != LoadingOptions::default() => {
-            Err(invalid("--unit, --up, --strict", "a model", "a recording"))
+            Err(invalid("--unit, --up, --lighting, --strict", "a model", "a recording"))
         }
         true => runtime.block_on(play(args, args.playback_config(state.path())?)),
         false => runtime.block_on(view_model(args, state.path())),

@@ -15,6 +15,7 @@
 //! | visibility | triangle id and depth of each sample, with holes of cut-outs | some triangle is not blended |
 //! | record visible | triangles that are visible, as the occluders of the next frame (compute) | occlusion culling |
 //! | unpack | ids, converted from the output of the compute rasterizer (compute) | the compute rasterizer drew the visibility |
+//! | ambient occlusion | part of the ambient light that reaches each texel, without noise (compute) | the look has ambient occlusion |
 //! | blended | light of the blended triangles, blended in draw order without depth writes | two-pass transparency, some triangle is blended |
 //! | oit count, oit allocate, oit fill | a list of the blended fragments of each pixel | exact transparency, some triangle is blended |
 //! | oit resolve | lists sorted by depth, shaded and blended (compute) | exact transparency, some triangle is blended |

@@ -31,6 +31,8 @@ pub enum Pass {
     RecordVisible,
     /// Converts the keys of the compute rasterizer (triangle and depth) to ids.
     Unpack,
+    /// Finds the surface of each texel of the ambient occlusion, and how much ambient light reaches it.
+    AmbientOcclusion,
     /// Blends translucent triangles in draw order.
     Blended,
     /// Counts the blended fragments of each pixel.
@@ -76,7 +78,7 @@ pub enum RenderStage {
 
 impl Pass {
     /// All passes, in execution order.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 25] = [
         Self::UniformUpload,
         Self::RasterShadow,
         Self::RasterVisibility,
@@ -88,6 +90,7 @@ impl Pass {
         Self::Visibility,
         Self::RecordVisible,
         Self::Unpack,
+        Self::AmbientOcclusion,
         Self::Blended,
         Self::OitCount,
         Self::OitAllocate,
@@ -117,6 +120,7 @@ impl Pass {
             Self::Visibility => "visibility",
             Self::RecordVisible => "record visible",
             Self::Unpack => "unpack",
+            Self::AmbientOcclusion => "ambient occlusion",
             Self::Blended => "blended",
             Self::OitCount => "oit count",
             Self::OitAllocate => "oit allocate",

@@ -42,16 +42,20 @@ fn wire_lighting(scene: &Scene) -> v1::Lighting {
         ToneMapping::Reinhard => v1::ToneMapping::Reinhard,
         ToneMapping::Aces => v1::ToneMapping::Aces,
     };
+    let studio = look.studio_light(scene.up);
     v1::Lighting {
         to_sun: look.to_sun(scene.up).iter().map(|component| *component as f32).collect(),
         sunlight: look.sunlight.to_vec(),
         skylight: look.skylight.to_vec(),
         zenith: look.zenith.to_vec(),
         horizon: look.horizon.to_vec(),
-        ground: look.ground.map(|ground| ground.color.to_vec()).unwrap_or_default(),
+        ground: look.ground_color(scene.up).map(Vec::from).unwrap_or_default(),
         shadows: look.shadow.is_some(),
         exposure: look.exposure,
         tone_mapping: tone_mapping.into(),
+        ambient_cube: studio.map(|studio| studio.ambient_cube.as_flattened().to_vec()).unwrap_or_default(),
+        fill: studio.map(|studio| studio.fill.to_vec()).unwrap_or_default(),
+        ambient_occlusion_radius: look.ambient_occlusion.map(|occlusion| occlusion.radius),
     }
 }
 

@@ -30,4 +30,5 @@ mod shadow_layers;
 mod shadow_methods;
 mod shadow_terminator;
 mod snapshots;
+mod studio;
 mod visibility;

@@ -53,17 +53,19 @@ impl Default for Material {
 }
 
 impl Material {
-    /// The color of surfaces whose source has none, linear: a copper tone that differs clearly from the default sky,
-    /// the default ground and its shadows, in luminance or in hue.
-    pub const UNSPECIFIED_COLOR: [f32; 3] = [0.65, 0.40, 0.22];
+    /// The color of surfaces whose source has none, linear: a steel blue of medium luminance, which differs clearly from
+    /// the background and the shadows of a studio.
+    pub const UNSPECIFIED_COLOR: [f32; 3] = [0.19, 0.31, 0.47];
 
-    /// The material of surfaces whose source has none: [`Self::UNSPECIFIED_COLOR`], double-sided. An empty name becomes
-    /// `default`.
+    /// The material of surfaces whose source has none: [`Self::UNSPECIFIED_COLOR`] with a wide highlight, double-sided.
+    /// An empty name becomes `default`.
     pub fn unspecified(name: &str) -> Self {
         Self {
             name: if name.is_empty() { "default" } else { name }.into(),
             ambient: Self::UNSPECIFIED_COLOR,
             diffuse: Self::UNSPECIFIED_COLOR,
+            specular: [0.10; 3],
+            shininess: 24.0,
             double_sided: true,
             ..Self::default()
         }

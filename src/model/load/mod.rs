@@ -68,7 +68,7 @@ use asset_dir::{AssetDir, ReferencedFile};
 
 use crate::backend_settings::BackendSettings;
 use crate::error::Result;
-use crate::scene::{LengthUnit, LookPreset, PresetRequest, RenderSettings, Scene, SceneParts, UpAxis};
+use crate::scene::{LengthUnit, Lighting, LookPreset, PresetRequest, RenderSettings, Scene, SceneParts, UpAxis};
 
 /// How the files of a scene are read.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -80,6 +80,8 @@ pub struct LoadOptions {
     pub unit: Option<LengthUnit>,
     /// Replaces the up axis of the file format or of `scene.toml`.
     pub up: Option<UpAxis>,
+    /// Replaces the lighting of the model or of `scene.toml`.
+    pub lighting: Option<Lighting>,
 }
 
 impl LoadOptions {
@@ -88,10 +90,13 @@ impl LoadOptions {
         if self.is_strict { files.strict() } else { files.clone() }
     }
 
-    /// Sets the unit and the up axis of a model that is opened without `scene.toml`.
+    /// Sets the unit, the up axis and the lighting of a model that is opened without `scene.toml`.
     fn apply_to_model(&self, parts: &mut SceneParts) {
         parts.unit = self.unit.map(LengthUnit::meters).or(parts.unit);
         parts.up = self.up.unwrap_or(parts.up);
+        if let Some(lighting) = self.lighting.filter(|lighting| *lighting != parts.look.lighting) {
+            parts.look = lighting.settings();
+        }
     }
 }
 
@@ -242,6 +247,55 @@ mod tests {
             let shadow = still.with_shadow_map_for(software).shadow;
             assert_eq!(shadow, by_rule.with_shadow_map_for(hardware).shadow, "{manifest}");
             assert_ne!(shadow, by_rule.with_shadow_map_for(software).shadow, "control: the rule differs on a CPU");
+        }
+    }
+
+    /// Negative control: a file with materials of its own.
+    #[test]
+    fn models_without_materials_are_in_a_studio() {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).expect("a writable file");
+        write("red.mtl", "newmtl red\nKd 1 0 0\n");
+        let triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n";
+        write("plain.obj", triangle);
+        write("undefined.obj", &format!("usemtl red\n{triangle}"));
+        let red = |x: u32, y: u32| format!("v {x} {y} 0 1 0 0\n");
+        write("uniform.obj", &format!("{}{}{}f 1 2 3\n", red(0, 0), red(1, 0), red(0, 1)));
+        write("tinted.obj", "v 0 0 0 1 0 0\nv 1 0 0 0 1 0\nv 0 1 0 0 0 1\nf 1 2 3\n");
+        write("red.obj", &format!("mtllib red.mtl\nusemtl red\n{triangle}"));
+        write("part.stl", "solid\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendsolid\n");
+        let header = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n";
+        let colors = "property uchar red\nproperty uchar green\nproperty uchar blue\n";
+        let faces = "element face 1\nproperty list uchar int vertex_indices\nend_header\n";
+        write("scan.ply", &format!("{header}{colors}{faces}0 0 0 9 9 9\n1 0 0 9 9 9\n0 1 0 9 9 9\n3 0 1 2\n"));
+        let manifest = |entries: &[&str], rest: &str| {
+            let entries = entries.iter().map(|entry| format!("[[domain]]\nmodel = '{entry}'\n"));
+            write("scene.toml", &format!("{rest}{}", entries.collect::<String>()));
+            "scene.toml"
+        };
+        let lighting_of = |name: &str, lighting: Option<Lighting>| {
+            let path = if is_built_in(name) { name.into() } else { folder.path().join(name) };
+            let path = path.to_string_lossy();
+            let options = LoadOptions { lighting, ..LoadOptions::default() };
+            open_with(&path, &options).unwrap_or_else(|error| panic!("{name}: {error}")).scene.look.lighting
+        };
+        for name in ["plain.obj", "undefined.obj", "uniform.obj", "tinted.obj", "part.stl", "scan.ply"] {
+            assert_eq!(lighting_of(name, None), Lighting::Studio, "{name}");
+            assert_eq!(lighting_of(name, Some(Lighting::Outdoor)), Lighting::Outdoor, "{name} with an option");
+        }
+        assert_eq!(lighting_of("red.obj", None), Lighting::Outdoor, "control");
+        assert_eq!(lighting_of("red.obj", Some(Lighting::Studio)), Lighting::Studio);
+        assert_eq!(lighting_of("tree", None), Lighting::Outdoor);
+        for (entries, rest, expected) in [
+            (&["part.stl", "plain.obj"][..], "", Lighting::Studio),
+            (&["part.stl", "red.obj"], "", Lighting::Outdoor),
+            (&["red.obj", "part.stl"], "", Lighting::Outdoor),
+            (&["part.stl", "tree"], "", Lighting::Outdoor),
+            (&["part.stl"], "look.lighting = 'outdoor'\n", Lighting::Outdoor),
+            (&["red.obj"], "look = { lighting = 'studio', exposure = 2 }\n", Lighting::Studio),
+        ] {
+            assert_eq!(lighting_of(manifest(entries, rest), None), expected, "{entries:?} {rest}");
+            assert_eq!(lighting_of("scene.toml", Some(Lighting::Studio)), Lighting::Studio, "{entries:?} {rest}");
         }
     }
 }

@@ -15,7 +15,7 @@ use super::surface::{self, ModelOptions};
 use super::values::Corrections;
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
-use crate::scene::{SceneParts, UpAxis};
+use crate::scene::{Lighting, SceneParts, UpAxis};
 
 /// The arrays that are read. Other arrays are named in a remark.
 const ARRAY_NAMES: [&str; 12] = [
@@ -55,7 +55,7 @@ pub(super) fn is_model(files: &AssetDir, name: &str) -> bool {
 /// # Errors
 /// `Invalid` with the file, the array, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
-    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
+    let mut parts = SceneParts { up: UpAxis::Z, look: Lighting::Studio.settings(), ..SceneParts::named(stem_of(name)) };
     let content = files.read(name, MAX_MODEL_BYTES)?;
     let model =
         parse(files, &content, &mut parts.remarks).map_err(|error| error.prefix_field(&format!("file '{name}'")))?;

@@ -256,7 +256,8 @@ mod tests {
         let hashes = Arc::new(hashes);
         let memory = MemoryReservation::unlimited();
         let unit = Some("mm".parse().expect("a unit"));
-        let options = LoadOptions { is_strict: true, unit, up: Some(crate::scene::UpAxis::Z) };
+        let options =
+            LoadOptions { is_strict: true, unit, up: Some(crate::scene::UpAxis::Z), ..LoadOptions::default() };
         let strict = lenient.clone().with_options(options);
         let conventions = |opened: OpenedScene| (opened.scene.unit, opened.scene.up.name());
         assert_eq!(strict.open("b.obj", &memory).map(conventions), Ok((0.001, "z")));

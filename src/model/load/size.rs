@@ -140,7 +140,12 @@ mod tests {
             assert_eq!(open(name, unit, None).1, open(name, None, None).1, "{name}");
             assert_eq!(open(name, None, up).0, open(name, None, None).0, "{name}");
         }
-        let tree = LoadOptions { unit: Some(LengthUnit::METER), up: Some(UpAxis::Z), is_strict: true };
+        let tree = LoadOptions {
+            unit: Some(LengthUnit::METER),
+            up: Some(UpAxis::Z),
+            is_strict: true,
+            ..LoadOptions::default()
+        };
         assert_eq!(open_with("tree", &tree).expect("the built-in scene").scene.up, UpAxis::Z);
     }
 }

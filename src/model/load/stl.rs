@@ -19,7 +19,7 @@ use super::text::{lines, without_byte_order_mark};
 use crate::domain::{Material, origin_of_positions};
 use crate::error::{Result, invalid};
 use crate::memory::TemporaryReservation;
-use crate::scene::{SceneParts, UpAxis};
+use crate::scene::{Lighting, SceneParts, UpAxis};
 
 /// Bytes of a binary header: a comment, then the number of triangles.
 const HEADER_BYTES: usize = 84;
@@ -33,7 +33,7 @@ const TRIANGLE_BYTES: usize = 50;
 /// # Errors
 /// `Invalid` with the file, the line or triangle, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
-    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
+    let mut parts = SceneParts { up: UpAxis::Z, look: Lighting::Studio.settings(), ..SceneParts::named(stem_of(name)) };
     let content = files.read(name, MAX_MODEL_BYTES)?;
     let memory = files.reserve_polygons(name, content.len())?;
     let mut polygons =

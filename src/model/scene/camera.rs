@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3x4, Matrix4, Point3, Vector3};
 
-use super::{FrameSize, PixelRect, Scene, UpAxis};
+use super::{FrameSize, PixelRect, Scene};
 use crate::error::{Result, invalid};
 
 /// An axis-aligned bounding box in scene units. Empty if `min > max`.
@@ -112,13 +112,13 @@ impl Camera {
     /// A camera that views the scene's rest bounds from the front, slightly from above and from the side. The bounds
     /// fill an image of `width` x `height` pixels up to a margin.
     pub fn fit_to_scene(scene: &Scene, width: u32, height: u32) -> Self {
-        Self::fit_to_bounds(scene.up, scene.rest_bounds, FrameSize::new(width, height))
+        Self::fit_to_bounds(scene, scene.rest_bounds, FrameSize::new(width, height))
     }
 
     /// As [`Self::fit_to_scene`], for other bounds.
-    pub(super) fn fit_to_bounds(up_axis: UpAxis, bounds: BoundingBox, FrameSize { width, height }: FrameSize) -> Self {
-        let up = up_axis.vector();
-        let to_camera = up_axis.rotation_from_y_up() * Vector3::new(0.42, 0.14, 0.90).normalize();
+    pub(super) fn fit_to_bounds(scene: &Scene, bounds: BoundingBox, FrameSize { width, height }: FrameSize) -> Self {
+        let up = scene.up.vector();
+        let to_camera = scene.up.rotation_from_y_up() * Vector3::from(scene.look.lighting.to_camera()).normalize();
         let vertical_degrees = 28.0_f64;
         let slope = IMAGE_FILL * (vertical_degrees / 2.0).to_radians().tan();
         let aspect = f64::from(width.max(1)) / f64::from(height.max(1));

@@ -60,7 +60,7 @@ impl CameraSource {
         // Many small domains can cover the image.
         let is_visible = matches!(coverage(&clip_from_world, bounds, size), Coverage::Pixels) && small_count > 0;
         match bounds.is_finite() && !is_visible {
-            true => Framing { camera: Camera::fit_to_bounds(scene.up, bounds, size), is_moved: true },
+            true => Framing { camera: Camera::fit_to_bounds(scene, bounds, size), is_moved: true },
             false => keep,
         }
     }

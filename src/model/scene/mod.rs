@@ -3,6 +3,7 @@
 //! The data of all domains is packed into shared buffers. [`Layout`] stores where the vertices, corners, triangles and
 //! coordinates of each domain begin.
 
+mod ambient_occlusion;
 mod camera;
 mod deformation;
 mod drawn_bounds;
@@ -15,6 +16,7 @@ mod framing;
 mod layout;
 mod length_unit;
 mod light_space;
+mod lighting;
 mod look_preset;
 mod mesh_edges;
 mod pixel_rect;
@@ -28,6 +30,7 @@ mod step_update;
 mod transform_format;
 mod transform_roots;
 
+pub use ambient_occlusion::AmbientOcclusion;
 pub use camera::{BoundingBox, Camera, Lens, View};
 pub use deformation::{DeformationSettings, NormalMethod, StorageType};
 pub use drawn_bounds::{DrawnBounds, FrameBounds};
@@ -39,6 +42,7 @@ pub use framing::{CameraSource, Framing};
 pub use layout::{DomainLayout, Layout};
 pub use length_unit::LengthUnit;
 pub use light_space::{OrientedBounds, light_axes};
+pub use lighting::{Lighting, StudioLight};
 pub use look_preset::{FrameAntialiasing, LookOverrides, LookPreset, PresetRequest, RendererKind};
 pub use mesh_edges::MeshEdges;
 pub use pixel_rect::PixelRect;

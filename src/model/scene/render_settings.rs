@@ -6,7 +6,7 @@ use std::str::FromStr;
 use nalgebra::Vector3;
 
 use super::shadow::ShadowSettings;
-use super::{Antialiasing, Bloom, MeshEdges, PresetRequest, ToneMapping};
+use super::{AmbientOcclusion, Antialiasing, Bloom, Lighting, MeshEdges, PresetRequest, ToneMapping};
 use crate::error::{Error, Result, invalid};
 
 /// The axis that points up.
@@ -56,12 +56,13 @@ impl FromStr for UpAxis {
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Ground {
-    pub color: [f32; 3],
+    /// Linear color. Without one, the ground shows only the shadows on it ([`RenderSettings::ground_color`]).
+    pub color: Option<[f32; 3]>,
 }
 
 impl Default for Ground {
     fn default() -> Self {
-        Self { color: [0.40, 0.41, 0.36] }
+        Self { color: Some([0.40, 0.41, 0.36]) }
     }
 }
 
@@ -111,6 +112,9 @@ pub struct RenderSettings {
     /// If set, the renderer chooses `antialias`, `samples`, and the method, size and blur of `shadow`. If `None`, the
     /// values in these fields are used. Set by [`Self::with_preset`]; scene files always set it.
     pub preset: Option<PresetRequest>,
+    /// The choice that has determined the other fields. It also selects the ambient light
+    /// ([`RenderSettings::studio_light`]) and the direction of the default camera.
+    pub lighting: Lighting,
     /// Direction towards the sun in Y-up coordinates; rotated to the scene's up axis.
     pub sun: [f32; 3],
     /// Color times intensity of the sun.
@@ -122,6 +126,7 @@ pub struct RenderSettings {
     pub horizon: [f32; 3],
     pub shadow: Option<ShadowSettings>,
     pub ground: Option<Ground>,
+    pub ambient_occlusion: Option<AmbientOcclusion>,
     /// Lines along the edges of the faces. A frame request can override them.
     pub edges: Option<MeshEdges>,
     /// Samples per pixel for multisampling, 1 or 4.
@@ -152,6 +157,7 @@ impl Default for RenderSettings {
     fn default() -> Self {
         Self {
             preset: None,
+            lighting: Lighting::Outdoor,
             sun: [0.45, 0.80, 0.55],
             // Sunlight and skylight add up to about 1 per channel, so that white surfaces are not clipped to uniform
             // white.
@@ -163,6 +169,7 @@ impl Default for RenderSettings {
             horizon: [0.34, 0.54, 0.79],
             shadow: Some(ShadowSettings::default()),
             ground: Some(Ground::default()),
+            ambient_occlusion: None,
             edges: None,
             samples: 4,
             antialias: Antialiasing::Msaa,
@@ -200,6 +207,7 @@ impl RenderSettings {
             return Err(invalid("look.fragments", format!("1 to {MAX_FRAGMENTS}"), format!("{:?}", self.fragments)));
         }
         self.check_post()?;
+        self.ambient_occlusion.map_or(Ok(()), AmbientOcclusion::check)?;
         self.edges.map_or(Ok(()), |edges| edges.check("look.edges"))?;
         self.shadow.map_or(Ok(()), |shadow| shadow.check())
     }

@@ -1,5 +1,6 @@
 //! Twins of GLSL declarations: uniform and storage blocks, texture units, bindings and workgroup sizes.
 
+pub(crate) mod ambient;
 pub(crate) mod cull;
 pub(crate) mod material;
 pub(crate) mod oit;
@@ -32,12 +33,16 @@ pub(crate) const TRIANGLE_ID_UNIT: u32 = 25;
 pub(crate) const DEPTH_UNIT: u32 = 26;
 /// Depth of a variance shadow map, whose moments are at [`SHADOW_UNIT`].
 pub(crate) const SHADOW_DEPTH_UNIT: u32 = 27;
+/// Ambient visibility.
+pub(crate) const AMBIENT_UNIT: u32 = 28;
 /// Texture unit of the image that a program of the blur, the bloom or the sRGB encoding reads.
 pub(crate) const SOURCE_UNIT: u32 = 0;
-/// Maximum number of textures that the shading reads in addition to the scene's images: one for each of the 28 units
-/// from [`SHADOW_UNIT`] to [`SHADOW_DEPTH_UNIT`], except the 12 color and normal units, [`VALUE_UNIT`] and
+/// Texture unit of the ambient visibility that the filter of the ambient occlusion reads.
+pub(crate) const NOISY_VISIBILITY_UNIT: u32 = 1;
+/// Maximum number of textures that the shading reads in addition to the scene's images: one for each of the 29 units
+/// from [`SHADOW_UNIT`] to [`AMBIENT_UNIT`], except the 12 color and normal units, [`VALUE_UNIT`] and
 /// [`TRIANGLE_ID_UNIT`].
-pub(crate) const FIXED_TEXTURE_READS: usize = 14;
+pub(crate) const FIXED_TEXTURE_READS: usize = 15;
 const _: () = assert!(NORMAL_UNIT + MAX_ARRAYS as u32 <= POSITION_UNIT, "texture units overlap");
 
 /// Uniform block bindings.

@@ -36,6 +36,11 @@ pub(super) enum Resource {
     Ids,
     /// Depth of each sample.
     Depth,
+    /// Depth and normal of each texel of the ambient occlusion.
+    AmbientSurface,
+    /// Ambient visibility of each texel, before the noise is removed.
+    NoisyVisibility,
+    AmbientVisibility,
     /// Blended light of two-pass transparency.
     BlendLayer,
     /// Number of blended fragments of each pixel.
@@ -131,6 +136,7 @@ const SHADOW_LOOKUP: Accesses = &[
 const SHADING: Accesses = &[
     (Resource::Ids, Access::Sampled),
     (Resource::Depth, Access::Sampled),
+    (Resource::AmbientVisibility, Access::Sampled),
     (Resource::BlendLayer, Access::Sampled),
     (Resource::OitLayers, Access::Sampled),
     (Resource::OitCounts, Access::Sampled),
@@ -203,6 +209,18 @@ const PASS_ACCESSES: [(Pass, &[Accesses]); Pass::ALL.len()] = [
         ]],
     ),
     (Pass::Unpack, &[&[(Resource::RasterKeys, Access::StorageRead), (Resource::Ids, Access::ImageWrite)]]),
+    (
+        Pass::AmbientOcclusion,
+        &[&[
+            (Resource::Ids, Access::Sampled),
+            (Resource::Depth, Access::Sampled),
+            (Resource::AmbientSurface, Access::ImageWrite),
+            (Resource::AmbientSurface, Access::Sampled),
+            (Resource::NoisyVisibility, Access::ImageWrite),
+            (Resource::NoisyVisibility, Access::Sampled),
+            (Resource::AmbientVisibility, Access::ImageWrite),
+        ]],
+    ),
     (
         Pass::Blended,
         &[

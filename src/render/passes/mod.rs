@@ -4,6 +4,7 @@
 //! technique. [`PassRecorder`] issues the barriers, checks for errors and collects statistics.
 
 mod accesses;
+pub(crate) mod ambient;
 pub(crate) mod aov;
 pub(crate) mod blended;
 pub(crate) mod cull;

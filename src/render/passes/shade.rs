@@ -2,7 +2,9 @@
 
 use super::draw::{bind_shadow, bind_visibility};
 use super::recorder::{FrameContext, PassRecorder};
-use crate::layout::{BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, INNER_EDGES_BINDING, TILE, TILES_BINDING};
+use crate::layout::{
+    AMBIENT_UNIT, BLEND_LAYER_UNIT, EMPTY_TILE_LIST, FRAGMENT_COUNT_UNIT, INNER_EDGES_BINDING, TILE, TILES_BINDING,
+};
 use crate::pass::Pass;
 use crate::region::Band;
 use modalcast_model::error::Result;
@@ -23,6 +25,9 @@ pub(crate) fn draw(recorder: &mut PassRecorder<'_>, frame: &FrameContext<'_>, ba
     if let Some(oit) = &target.oit {
         oit.blend_layers.bind(BLEND_LAYER_UNIT);
         oit.fragment_counts.bind(FRAGMENT_COUNT_UNIT);
+    }
+    if let Some(images) = &target.ambient {
+        images.visibility.bind(AMBIENT_UNIT);
     }
     target.scene_color.bind_image(COLOR_IMAGE);
     if let Some(finest_mip) = target.bloom_mips.first() {

@@ -1,5 +1,6 @@
 //! Features of a scene's shaders. The defines of the sources are derived from them.
 
+use crate::layout::ambient::AmbientSampling;
 use crate::types::BlurMethod;
 use modalcast_model::scene::{Culling, ShadowMethod, ShadowSettings};
 
@@ -19,6 +20,8 @@ pub(crate) struct ShaderFeatures {
     /// Two-pass transparency may draw parts of blended triangles as opaque: those of high alpha.
     pub(crate) opaque_parts: bool,
     pub(crate) shadow: Option<ShadowSettings>,
+    /// The sampling of the ambient occlusion for the device; none without it.
+    pub(crate) ambient_occlusion: Option<AmbientSampling>,
     /// The method for the device; never `Auto`.
     pub(crate) blur_method: BlurMethod,
     /// The method for the device; never `Auto`.
@@ -37,6 +40,7 @@ impl ShaderFeatures {
         oit: false,
         opaque_parts: false,
         shadow: None,
+        ambient_occlusion: None,
         blur_method: BlurMethod::Tiles,
         culling: Culling::None,
     };

@@ -14,6 +14,7 @@ use self::culling::{cull_buffer_sizes, cull_passes, select_culling};
 use self::features::ShaderFeatures;
 use self::shadow_map::shadow_textures;
 use crate::device::gl::Limits;
+use crate::layout::ambient::AmbientSampling;
 use crate::layout::material::MATERIAL_BYTES;
 use crate::pass::Pass;
 use crate::scene_data::geometry::{BlendMode, DrawGroup, blend_mode, groups, used_materials, uses_material_table};
@@ -21,7 +22,10 @@ use crate::scene_data::textures::{TextureRole, arrays};
 use crate::types::BlurMethod;
 use crate::uniforms::cascades::ShadowCascades;
 use crate::uniforms::frame::FrameUniforms;
-use modalcast_model::scene::{Antialiasing, Culling, Scene, ShadowSettings, ToneMapping, Transparency};
+use modalcast_model::scene::{
+    Antialiasing, Culling, Lighting, LookPreset, RenderSettings, RendererKind, Scene, ShadowSettings, ToneMapping,
+    Transparency,
+};
 
 /// A buffer or texture and its size.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
@@ -97,7 +101,7 @@ impl ScenePlan {
         let (groups, _) = groups(scene);
         let culling = select_culling(scene, limits);
         let shadow = scene.look.with_shadow_map_for(limits.renderer_kind()).shadow;
-        let features = features(scene, shadow, blur_method.resolve(limits.software), culling);
+        let features = features(scene, shadow, limits, blur_method, culling);
         let buffers = buffer_sizes(scene, culling);
         let allocations = buffers.named().map(|(name, bytes)| Allocation { name: name.to_string(), bytes: *bytes });
         let report = RenderPlan {
@@ -124,6 +128,7 @@ fn passes(scene: &Scene, groups: &[DrawGroup], features: &ShaderFeatures) -> Vec
     let has_visibility = has_blend_mode(BlendMode::Opaque) || has_blend_mode(BlendMode::Mask) || features.opaque_parts;
     passes.extend(cull_passes(features.culling));
     passes.extend(has_visibility.then_some(Pass::Visibility));
+    passes.extend(features.ambient_occlusion.map(|_| Pass::AmbientOcclusion));
     passes.extend(if features.blend_layers { blend_passes(scene) } else { &[] });
     passes.push(Pass::Background);
     passes.extend(has_visibility.then_some(Pass::Shade));
@@ -223,6 +228,7 @@ fn shadow_allocations(shadow: &ShadowSettings, blur_method: BlurMethod) -> impl 
 fn features(
     scene: &Scene,
     shadow: Option<ShadowSettings>,
+    limits: &Limits,
     blur_method: BlurMethod,
     culling: Culling,
 ) -> ShaderFeatures {
@@ -236,8 +242,19 @@ fn features(
         oit: features.blend && look.transparency == Transparency::OrderIndependent,
         opaque_parts: has_opaque_parts(scene),
         shadow,
-        blur_method,
+        ambient_occlusion: look.ambient_occlusion.map(|_| AmbientSampling::of(ambient_sampling_kind(look, limits))),
+        blur_method: blur_method.resolve(limits.software),
         culling,
+    }
+}
+
+/// The kind of renderer whose sampling of the ambient occlusion is used: that of a GPU unless a preset or the rule
+/// chooses the settings of a CPU.
+fn ambient_sampling_kind(look: &RenderSettings, limits: &Limits) -> RendererKind {
+    match look.preset.map(|request| request.preset) {
+        Some(Some(LookPreset::Preview)) => RendererKind::Software,
+        Some(None) => limits.renderer_kind(),
+        Some(Some(LookPreset::Standard | LookPreset::Best)) | None => RendererKind::Hardware,
     }
 }
 
@@ -278,6 +295,14 @@ fn omitted_features(scene: &Scene, culling: Culling) -> Vec<OmittedFeature> {
             "no lookup per triangle",
         ),
         omit_unless(look.ground.is_some(), "ground", 0, &[], "no ground in the shading"),
+        omit_unless(look.lighting == Lighting::Studio, "studio", 0, &[], "ambient light of one color, no fill light"),
+        omit_unless(
+            look.ambient_occlusion.is_some(),
+            "ambient occlusion",
+            0,
+            &[Pass::AmbientOcclusion],
+            "no lookup of the ambient visibility, up to 24 bytes per pixel less",
+        ),
         omit_unless(
             look.bloom.is_some(),
             "bloom",
@@ -309,7 +334,8 @@ mod tests {
     use super::*;
     use crate::scene_data::geometry::tests::squares;
     use modalcast_model::domain::{AlphaMode, Material, Texture};
-    use modalcast_model::scene::{Bloom, MeshEdges, RenderSettings};
+    use modalcast_model::scene::PresetRequest;
+    use modalcast_model::scene::{AmbientOcclusion, Bloom, MeshEdges};
 
     fn names(allocations: &[Allocation]) -> Vec<&str> {
         allocations.iter().map(|allocation| allocation.name.as_str()).collect()
@@ -331,7 +357,9 @@ mod tests {
         let look =
             RenderSettings { bloom: Some(Bloom::default()), tone: ToneMapping::Aces, dither: true, ..parts.look };
         let look = RenderSettings { edges: Some(MeshEdges::default()), ..look };
-        parts.look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
+        let look = RenderSettings { antialias: Antialiasing::Fxaa, culling: Culling::Occlusion, ..look };
+        let ambient_occlusion = Some(AmbientOcclusion::default());
+        parts.look = RenderSettings { lighting: Lighting::Studio, ambient_occlusion, ..look };
         parts
     }
 
@@ -350,7 +378,11 @@ mod tests {
         let scene_features = ["normal maps", "textures", "mask", "blend", "shadows", "many materials", "ground"];
         assert_eq!(
             omitted,
-            [&scene_features[..], &["bloom", "tone curve", "fxaa", "culling", "mesh edges", "dither"]].concat()
+            [
+                &scene_features[..],
+                &["studio", "ambient occlusion", "bloom", "tone curve", "fxaa", "culling", "mesh edges", "dither"]
+            ]
+            .concat()
         );
         assert_eq!(plan.omitted[0].bytes, 16 * 4, "expected the tangents of four corners");
         assert_eq!(
@@ -387,6 +419,30 @@ mod tests {
     }
 
     #[test]
+    fn ambient_occlusion_has_the_sampling_of_the_preset_or_of_the_renderer() {
+        let sampling = |preset: Option<Option<LookPreset>>, software: bool| {
+            let request = preset.map(|preset| PresetRequest { preset, ..PresetRequest::default() });
+            let look = RenderSettings { preset: request, ..Lighting::Studio.settings() };
+            let mut parts = squares(vec![Material::default()]);
+            parts.look = look;
+            let limits = Limits { software, max_storage_bytes: u64::MAX, ..Limits::default() };
+            let plan = ScenePlan::new(&Scene::new(parts).expect("a valid scene"), &limits, BlurMethod::Auto);
+            plan.features.ambient_occlusion.expect("ambient occlusion")
+        };
+        let [hardware, software] = [RendererKind::Hardware, RendererKind::Software].map(AmbientSampling::of);
+        assert_ne!(hardware, software);
+        for (preset, on_gpu, on_cpu) in [
+            (None, hardware, hardware),
+            (Some(None), hardware, software),
+            (Some(Some(LookPreset::Preview)), software, software),
+            (Some(Some(LookPreset::Standard)), hardware, hardware),
+            (Some(Some(LookPreset::Best)), hardware, hardware),
+        ] {
+            assert_eq!([sampling(preset, false), sampling(preset, true)], [on_gpu, on_cpu], "{preset:?}");
+        }
+    }
+
+    #[test]
     fn plan_of_a_full_featured_scene_omits_nothing() {
         let mut parts = full_featured_parts();
         parts.look.transparency = Transparency::TwoPass;
@@ -394,8 +450,8 @@ mod tests {
         assert_eq!(
             pass_names(&plan),
             [
-                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility", "blended"][..],
-                &["background", "shade", "bloom", "encode"]
+                &["shadow cull", "shadow", "blur", "occluders", "cull", "visibility"][..],
+                &["ambient occlusion", "blended", "background", "shade", "bloom", "encode"]
             ]
             .concat()
         );

@@ -18,8 +18,8 @@ use modalcast_model::domain::{AlphaMode, Material};
 use modalcast_model::error::Result;
 use modalcast_model::raster::{DrawTarget, Rasterizer};
 use modalcast_model::scene::{
-    Antialiasing, Bloom, BoundingBox, Camera, Culling, Ground, Lens, PixelRect, RenderSettings, Scene, ShadowSettings,
-    Transparency, View,
+    Antialiasing, Bloom, BoundingBox, Camera, Culling, Ground, Lens, Lighting, PixelRect, RenderSettings, Scene,
+    ShadowSettings, Transparency, View,
 };
 
 /// Frame with several bands of 64 rows; the last band has 8 rows.
@@ -99,6 +99,7 @@ fn looks() -> Vec<(&'static str, RenderSettings)> {
         ("FXAA, bloom, cascades", RenderSettings { bloom: Some(Bloom::default()), shadow: cascades, ..fxaa }),
         ("triangle culling", RenderSettings { culling: Culling::Triangles, ..exact }),
         ("occlusion culling", RenderSettings { culling: Culling::Occlusion, ..look(4) }),
+        ("studio with ambient occlusion", RenderSettings { shadow: look(4).shadow, ..Lighting::Studio.settings() }),
     ]
 }
 

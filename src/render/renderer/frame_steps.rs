@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use super::frame_readback::{FrameReadback, MAX_BAND_PIXELS};
 use crate::layout::TILE;
 use crate::pass::Pass;
+use crate::passes::ambient::AmbientStep;
 use crate::passes::post::BloomStep;
 use crate::passes::{self, FrameContext, OitFrame, PassRecorder};
 use crate::pieces::{PieceLoad, PieceRange};
@@ -46,6 +47,7 @@ pub(super) enum BandPass {
     Cull,
     Visibility(Band),
     RecordVisible,
+    Ambient(AmbientStep, Band),
     Blended(Band),
     OitCount(Band),
     OitSumCounts,
@@ -194,8 +196,15 @@ impl FramePlan<'_> {
             let bands = Band::divide([image.desc.width, image.desc.height], max_pixels);
             bands.into_iter().map(move |band| BandPass::Bloom(step, band))
         });
+        let ambient_bands = target.ambient.iter().flat_map(|images| {
+            let bands = Band::divide([images.surface.desc.width, images.surface.desc.height], max_pixels);
+            AmbientStep::ALL
+                .into_iter()
+                .flat_map(move |step| bands.clone().into_iter().map(move |band| BandPass::Ambient(step, band)))
+        });
         let mut groups = vec![
             (Pass::Visibility, visibility),
+            (Pass::AmbientOcclusion, ambient_bands.collect()),
             (Pass::Blended, blended),
             (Pass::Shade, of_bands(BandPass::Shade).collect()),
             (Pass::Bloom, bloom.collect()),
@@ -251,6 +260,7 @@ pub(super) fn record(
             None => passes::visibility::draw(recorder, frame, band, range),
         },
         (BandPass::RecordVisible, _) if rasterizer.is_none() => passes::cull::record_visible(recorder, frame),
+        (BandPass::Ambient(step, band), _) => passes::ambient::draw(recorder, frame, step, band),
         (BandPass::Blended(band), _) => passes::blended::draw(recorder, frame, band, range),
         (BandPass::OitCount(band), Some(oit)) => oit.count(recorder, band, range),
         (BandPass::OitSumCounts, Some(oit)) => oit.sum_counts(recorder),

@@ -192,7 +192,7 @@ impl Renderer {
         let antialiasing = buffers.antialiasing(size, params.samples);
         let blend_storage = blend_storage(&self.gl, &buffers.scene, size)?;
         let desc = TargetDesc::new(&self.gl, size, &buffers.look, antialiasing.samples, blend_storage);
-        let desc = TargetDesc { culling: buffers.culling(), ..desc };
+        let desc = TargetDesc { culling: buffers.culling(), ambient_sampling: buffers.ambient_sampling(), ..desc };
         self.ensure_target(desc)?;
         let has_edges = params.edges.is_some();
         let compile = &mut |source| self.programs.program(source);

@@ -226,8 +226,17 @@ fn software_renderer_refuses_shared_pictures() {
 fn timeout_names_the_pass_and_the_next_frame_is_drawn() {
     let (mut renderer, scene, buffers) = load_renderer();
     let params = params(&scene, 64);
-    let passes =
-        [Pass::Shadow, Pass::Blur, Pass::Visibility, Pass::Blended, Pass::Shade, Pass::Bloom, Pass::Encode, Pass::Read];
+    let passes = [
+        Pass::Shadow,
+        Pass::Blur,
+        Pass::Visibility,
+        Pass::AmbientOcclusion,
+        Pass::Blended,
+        Pass::Shade,
+        Pass::Bloom,
+        Pass::Encode,
+        Pass::Read,
+    ];
     for failing_index in 0..passes.len() {
         let mut pending_frame = renderer.submit(&buffers, &params).expect("submits");
         renderer.gl.wait("test", HANG_GUARD).expect("a finished frame");

@@ -47,6 +47,7 @@ pub(crate) struct SampleCountPrograms {
     pub(crate) blended: Option<Rc<Program>>,
     /// Programs of exact transparency.
     pub(crate) oit: Option<OitPrograms>,
+    pub(crate) ambient: Option<AmbientPrograms>,
     pub(crate) background: Rc<Program>,
     pub(crate) shade: Option<Rc<Program>>,
     /// Whether `shade` draws lines along mesh edges.
@@ -80,6 +81,14 @@ pub(crate) struct OcclusionPrograms {
 pub(crate) struct ShadowCullPrograms {
     pub(crate) cull_triangles: Rc<Program>,
     pub(crate) compact: Rc<Program>,
+}
+
+/// Programs of the ambient occlusion.
+#[derive(Debug, Clone)]
+pub(crate) struct AmbientPrograms {
+    pub(crate) surface: Rc<Program>,
+    pub(crate) occlusion: Rc<Program>,
+    pub(crate) filter: Rc<Program>,
 }
 
 /// Programs of exact transparency.
@@ -219,6 +228,14 @@ impl SampleCountPrograms {
             opaque_parts: compile_if(opaque_parts, compile, || options.visibility(BlendMode::Blend, samples))?,
             blended: compile_if(has_triangles(BlendMode::Blend) && !oit, compile, || options.blended(samples))?,
             oit: if oit { Some(OitPrograms::compile(options, samples, compile)?) } else { None },
+            ambient: match options.features.ambient_occlusion {
+                Some(sampling) => Some(AmbientPrograms {
+                    surface: compile(options.ambient_surface(sampling, samples))?,
+                    occlusion: compile(options.ambient_occlusion(sampling, samples))?,
+                    filter: compile(options.ambient_filter(sampling, samples))?,
+                }),
+                None => None,
+            },
             background: compile(options.background(samples))?,
             shade: compile_if(has_visibility, compile, || options.shade(samples, has_edges))?,
             has_edges,

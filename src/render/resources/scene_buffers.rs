@@ -12,6 +12,7 @@ use super::shadow_cache::{ShadowCache, ShadowKey};
 use super::shadow_map::ShadowMap;
 use super::shared_vertices::SceneVertices;
 use crate::device::gl::{self, Buffer, Gl, Program, Texture, VertexArray, VertexAttribute};
+use crate::layout::ambient::AmbientSampling;
 use crate::layout::material::{PackedMaterial, pack_materials};
 use crate::layout::{
     CORNER_NORMAL_UNIT, FIXED_TEXTURE_READS, MATERIAL_UNIT, TANGENT_UNIT, TRIANGLE_CORNER_UNIT, TRIANGLE_MATERIAL_UNIT,
@@ -26,7 +27,7 @@ use crate::scene_data::geometry::{
 };
 use crate::scene_data::inner_edges::{has_inner_edges, pack_inner_edges};
 use crate::scene_data::textures::{ArrayUse, TextureArray, TextureRole, arrays, check_texture_budget, find_layer};
-use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, post};
+use crate::shaders::{ImageFilter, MaterialUse, ProgramSource, ShaderOptions, ambient, post};
 use crate::types::{BlurMethod, FrameParams};
 use modalcast_model::error::Result;
 use modalcast_model::memory::MemoryBudget;
@@ -174,6 +175,7 @@ fn shader_options(
         image_filter: ImageFilter { anisotropy: gl.limits.anisotropy, blends_levels: !gl.limits.software },
         sample_positions: sample_positions.to_vec(),
         sample_resolve: post::sample_resolve(&scene.look),
+        ambient_light: ambient::ambient_light(scene.look.studio_light(scene.up)),
         post_depth_coverage: gl.limits.post_depth_coverage,
     }
 }
@@ -469,6 +471,11 @@ impl SceneBuffers {
     /// Culling method; never `Auto`.
     pub(crate) const fn culling(&self) -> Culling {
         self.options.features.culling
+    }
+
+    /// The sampling of the ambient occlusion; none without it.
+    pub(crate) const fn ambient_sampling(&self) -> Option<AmbientSampling> {
+        self.options.features.ambient_occlusion
     }
 
     /// Plan from which the buffers were created.

@@ -11,6 +11,7 @@ use super::oit::OitTarget;
 use super::target_desc::{BlendStorage, TargetDesc, create_image, create_nearest_texture};
 use crate::device::gl::{self, Buffer, Framebuffer, Gl, Texture, TextureDesc, VisibilityDirtyRegions};
 use crate::device::readback_ring::ReadbackRing;
+use crate::layout::ambient::AmbientSampling;
 use crate::layout::tile_list_bytes;
 use crate::region::{DirtyRegion, Region};
 use modalcast_model::error::Result;
@@ -41,10 +42,21 @@ pub(crate) struct RenderTarget {
     pub(crate) readback_source: Buffer,
     /// Memory in which the pixels leave the device: staging buffers for `readback_source`, or shared pictures.
     pub(crate) readback_ring: Rc<ReadbackRing>,
+    pub(crate) ambient: Option<AmbientImages>,
     /// Present with occlusion culling.
     pub(crate) depth_pyramid: Option<DepthPyramid>,
     pub(crate) depth: Texture,
     _memory: Arc<MemoryReservation>,
+}
+
+/// Images of the ambient occlusion.
+#[derive(Debug)]
+pub(crate) struct AmbientImages {
+    /// Depth and normal of each texel.
+    pub(crate) surface: Texture,
+    /// Visibility and depth of each texel, before and after the noise is removed.
+    pub(crate) noisy_visibility: Texture,
+    pub(crate) visibility: Texture,
 }
 
 /// Light of the blended triangles per sample, and their transmittance in alpha.
@@ -97,6 +109,7 @@ impl RenderTarget {
             bloom_mips: create_bloom_mips(gl, desc)?,
             readback_source: gl.buffer(desc.frame_bytes(), gl::STREAM_COPY, None)?,
             readback_ring: ReadbackRing::new(gl, cull_range.end, picture_memory),
+            ambient: desc.ambient_sampling.map(|sampling| create_ambient_images(gl, desc, sampling)).transpose()?,
             depth_pyramid: if desc.culling == Culling::Occlusion {
                 Some(DepthPyramid::new(gl, desc, &depth)?)
             } else {
@@ -106,6 +119,16 @@ impl RenderTarget {
             _memory: memory,
         })
     }
+}
+
+fn create_ambient_images(gl: &Rc<Gl>, desc: TargetDesc, sampling: AmbientSampling) -> Result<AmbientImages> {
+    let [width, height] = sampling.image_size([desc.width, desc.height]);
+    let desc = TargetDesc { width, height, ..TargetDesc::EMPTY };
+    Ok(AmbientImages {
+        surface: create_image(gl, desc, gl::RG32UI)?,
+        noisy_visibility: create_image(gl, desc, gl::RG32F)?,
+        visibility: create_image(gl, desc, gl::RG32F)?,
+    })
 }
 
 /// Creates the bloom pyramid: level 0 with the size of the frame, then levels of half the size, rounded up.

@@ -5,6 +5,7 @@ use std::rc::Rc;
 
 use crate::device::gl::{self, Gl, Texture, TextureDesc};
 use crate::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
+use crate::layout::ambient::AmbientSampling;
 use crate::layout::cull::CULL_COUNTER_BYTES;
 use crate::layout::oit::{OIT_HEADER_BYTES, RECORD_BYTES};
 use modalcast_model::error::Result;
@@ -25,6 +26,8 @@ pub(crate) struct TargetDesc {
     pub(crate) bloom_levels: u32,
     /// Culling method; never `Auto`.
     pub(crate) culling: Culling,
+    /// The sampling of the ambient occlusion; none without it.
+    pub(crate) ambient_sampling: Option<AmbientSampling>,
 }
 
 /// Resources that a frame needs for blended triangles.
@@ -46,6 +49,7 @@ impl TargetDesc {
         blend_storage: BlendStorage::None,
         bloom_levels: 0,
         culling: Culling::None,
+        ambient_sampling: None,
     };
 
     /// Target of a frame of a look, with at most `samples` samples per pixel.
@@ -87,10 +91,22 @@ impl TargetDesc {
         // RGBA16F, or f32 depth, of all levels, which together have 4/3 of the pixels.
         let bloom_bytes = if self.bloom_levels > 0 { 32 * pixels / 3 } else { 0 };
         let pyramid_bytes = if self.culling == Culling::Occlusion { 16 * pixels / 3 } else { 0 };
+        // RG32UI and twice RG32F.
+        let ambient_bytes = self.ambient_sampling.map_or(0, |sampling| {
+            let [width, height] = sampling.image_size([self.width, self.height]).map(u64::from);
+            24 * width * height
+        });
         let [_, readback_range] = self.readback_ranges();
         let staging_bytes = MAX_FRAMES_IN_FLIGHT as u64 * readback_range.end;
         // Ids and depth per sample, and RGBA16F and the encoded color per pixel.
-        8 * samples + 8 * pixels + self.frame_bytes() + staging_bytes + blend_bytes + bloom_bytes + pyramid_bytes
+        8 * samples
+            + 8 * pixels
+            + self.frame_bytes()
+            + staging_bytes
+            + blend_bytes
+            + bloom_bytes
+            + pyramid_bytes
+            + ambient_bytes
     }
 
     /// Byte ranges of the fragment counters and of the culling counters, which follow the encoded frame in the staging
@@ -133,6 +149,7 @@ pub(crate) fn create_nearest_texture(gl: &Rc<Gl>, desc: TextureDesc) -> Result<T
 #[cfg(test)]
 mod tests {
     use super::*;
+    use modalcast_model::scene::RendererKind;
 
     #[test]
     fn bytes_of_a_target_grow_with_its_features() {
@@ -145,6 +162,9 @@ mod tests {
         assert_eq!(layered.bytes() - multisampled.bytes(), 4 * 8 * 1000);
         let lists = TargetDesc { blend_storage: BlendStorage::FragmentLists(1 << 20), ..plain };
         assert!(lists.bytes() - plain.bytes() >= RECORD_BYTES << 20);
+        let ambient = |renderer| TargetDesc { ambient_sampling: Some(AmbientSampling::of(renderer)), ..plain };
+        assert_eq!(ambient(RendererKind::Hardware).bytes() - plain.bytes(), 24 * 1000);
+        assert_eq!(ambient(RendererKind::Software).bytes() - plain.bytes(), 24 * 250);
         for larger in [TargetDesc { bloom_levels: 3, ..plain }, TargetDesc { culling: Culling::Occlusion, ..plain }] {
             assert!(larger.bytes() > plain.bytes(), "{larger:?}");
         }

@@ -1,5 +1,6 @@
 //! Shader sources, assembled from the files in `shaders/` with only the branches that a scene needs.
 
+pub(crate) mod ambient;
 mod blur_strip;
 mod cull;
 pub(crate) mod oit;
@@ -29,6 +30,7 @@ const OIT_LISTS: &str = include_str!("../../../shaders/shared/oit_lists.glsl");
 const SKY: &str = include_str!("../../../shaders/shared/sky.glsl");
 const GROUND: &str = include_str!("../../../shaders/shared/ground_shading.glsl");
 const GROUND_PLANE: &str = include_str!("../../../shaders/shared/ground_plane.glsl");
+const SAFE_NORMALIZE: &str = include_str!("../../../shaders/shared/safe_normalize.glsl");
 const PHONG: &str = include_str!("../../../shaders/shared/phong.glsl");
 const BARYCENTRICS: &str = include_str!("../../../shaders/shared/barycentrics.glsl");
 const TRIANGLE_FETCH: &str = include_str!("../../../shaders/shared/triangle_fetch.glsl");
@@ -55,6 +57,8 @@ pub(crate) struct ShaderOptions {
     pub(crate) sample_positions: Vec<[f32; 2]>,
     /// GLSL that accumulates the samples of a pixel, see [`post::sample_resolve`].
     pub(crate) sample_resolve: String,
+    /// GLSL function `ambient_light`, see [`ambient::ambient_light`].
+    pub(crate) ambient_light: String,
     /// Whether the device supports `GL_ARB_post_depth_coverage`.
     pub(crate) post_depth_coverage: bool,
 }
@@ -182,9 +186,19 @@ impl ShaderOptions {
         let body = include_str!("../../../shaders/blended.frag");
         let sample_coverage =
             if self.features.opaque_parts { self.sample_defines(samples) + ALPHA_COVERAGE } else { String::new() };
-        let fragment =
-            [&head, FRAME, &material_lookups, TRIANGLE_ID, &self.sun_visibility(), PHONG, &sample_coverage, body]
-                .concat();
+        let fragment = [
+            &head,
+            FRAME,
+            &material_lookups,
+            TRIANGLE_ID,
+            &self.sun_visibility(),
+            SAFE_NORMALIZE,
+            &self.ambient_light,
+            PHONG,
+            &sample_coverage,
+            body,
+        ]
+        .concat();
         ProgramSource { label: "blended".into(), stages: vertex_and_fragment(vertex, fragment) }
     }
 
@@ -225,6 +239,8 @@ impl ShaderOptions {
             VISIBILITY_IDS,
             GROUND_PLANE,
             &self.sun_visibility(),
+            &self.ambient_light,
+            &self.ambient_visibility(),
             SKY,
             ground,
             &self.sample_resolve,
@@ -236,7 +252,7 @@ impl ShaderOptions {
     /// source of the lines along mesh edges, or empty.
     fn triangle_shading(&self, blend_modes: &[BlendMode], mesh_edges: &str) -> String {
         let material_lookups = self.material_lookups(blend_modes, UvDerivatives::Explicit);
-        [&material_lookups, PHONG, BARYCENTRICS, TRIANGLE_FETCH, mesh_edges, TRIANGLE_SHADING].concat()
+        [&material_lookups, SAFE_NORMALIZE, PHONG, BARYCENTRICS, TRIANGLE_FETCH, mesh_edges, TRIANGLE_SHADING].concat()
     }
 
     /// Converts the keys of the compute rasterizer to ids.
@@ -345,6 +361,7 @@ mod tests {
             image_filter: ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions,
             sample_resolve,
+            ambient_light: ambient::ambient_light(None),
             post_depth_coverage: false,
         }
     }

@@ -33,7 +33,8 @@ impl ShaderOptions {
     /// Sorts each list, and shades and blends its fragments to one blend layer per sample.
     pub(crate) fn oit_resolve(&self, samples: u32) -> ProgramSource {
         let mut text = self.head(&[]) + &bins_define() + &tile_list() + &self.material_defines(&[BlendMode::Blend]);
-        text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), OIT_LISTS].concat();
+        text += &[&self.sample_defines(samples), FRAME, CLIP, &self.sun_visibility(), &self.ambient_light, OIT_LISTS]
+            .concat();
         text += &self.triangle_shading(&[BlendMode::Blend], "");
         text += include_str!("../../../shaders/oit_resolve.comp");
         ProgramSource::compute(format!("oit resolve, {samples} samples"), text)
@@ -74,6 +75,7 @@ mod tests {
             image_filter: crate::shaders::ImageFilter { anisotropy: 1.0, blends_levels: false },
             sample_positions: vec![[0.5; 2]; 4],
             sample_resolve: String::new(),
+            ambient_light: String::new(),
             post_depth_coverage,
         }
     }

@@ -387,6 +387,7 @@ mod tests {
                 used_materials: vec![],
                 sample_positions: vec![],
                 sample_resolve: String::new(),
+                ambient_light: String::new(),
                 post_depth_coverage: false,
             };
             assert_eq!(options.sun_visibility().contains("const int GATHERS"), define != "SHADOW_STANDARD");

@@ -18,7 +18,7 @@ pub(crate) struct FrameUniforms {
     world_from_ndc: [[f32; 4]; 4],
     /// xyz: position of the camera. w: 1 if the scene has a ground and the camera is above it, else 0.
     eye: [f32; 4],
-    /// xyz: direction to the sun. w: 0.
+    /// xyz: direction to the sun. w: radius of the ambient occlusion, in scene units.
     to_sun: [f32; 4],
     sunlight: [f32; 4],
     skylight: [f32; 4],
@@ -34,15 +34,20 @@ pub(crate) struct FrameUniforms {
     shadow: [f32; 4],
     /// xyz: [`LightBox::ground`]. w: side of a shadow map texel in scene units.
     shadow_ground_plane: [f32; 4],
+    /// xyz: center, w: squared radius of the sphere outside of which the ambient light is not occluded.
+    occlusion_sphere: [f32; 4],
     /// xyz: color of the lines along mesh edges. w: their width in pixels.
     edges: [f32; 4],
 }
 
-const _: () = assert!(size_of::<FrameUniforms>() == 384, "FrameUniforms differs from shaders/shared/frame.glsl");
+const _: () = assert!(size_of::<FrameUniforms>() == 400, "FrameUniforms differs from shaders/shared/frame.glsl");
 
 /// Half the side of the ground's square, in multiples of the fade distance D. The ground's weight is exp(-(d / D)^2) at
 /// distance d. At the border it is exp(-36), so the rounded color is that of the horizon.
 const GROUND_EXTENT: f64 = 6.0;
+
+/// Upper bound of the squared radius of [`FrameUniforms::occlusion_sphere`], which must be finite in f32.
+const MAX_SQUARED_REACH: f64 = 1e38;
 
 /// Vertices that lie less than this fraction of the diagonal below the ground count as on the ground: the largest error
 /// of deformed vertices.
@@ -60,6 +65,10 @@ impl FrameUniforms {
         let to_sun = look.to_sun(scene.up);
         let ground_height = rest_bounds.min[scene.up.index()];
         let shadow = look.shadow.unwrap_or_default();
+        let ambient_radius = look
+            .ambient_occlusion
+            .map_or(0.0, |occlusion| f64::from(occlusion.radius) * scene.rest_bounds.diagonal().max(MIN_SIZE));
+        let occlusion_reach = 0.5 * bounds.diagonal() + ambient_radius;
         let light_box = LightBox::fit(&light_box_params(scene, look, params, origin));
         let rebased_camera = params.camera.relative_to(origin);
         let camera_from_world = rebased_camera.camera_from_world();
@@ -71,13 +80,13 @@ impl FrameUniforms {
             shadow_from_world: light_box.shadow_from_world.cast().into(),
             world_from_ndc: world_from_ndc(&clip_from_camera, &camera_from_world).cast().into(),
             eye: vec4_of(rebased_camera.eye(), flag(look.ground.is_some() && camera_is_above_ground(scene, params))),
-            to_sun: vec4_of(to_sun, 0.0),
+            to_sun: vec4_of(to_sun, ambient_radius),
             sunlight: color(look.sunlight, 0.0),
             skylight: color(look.skylight, 0.0),
             zenith: color(look.zenith, 0.0),
             horizon: color(look.horizon, 0.0),
             up: vec4_of(scene.up.vector(), ground_height),
-            ground: color(look.ground.unwrap_or_default().color, fade_distance),
+            ground: color(look.ground_color(scene.up).unwrap_or_default(), fade_distance),
             ground_center: vec4_of(center, GROUND_EXTENT * fade_distance),
             shadow: [
                 shadow.least_variance.max(shadow.variance_floor()),
@@ -86,6 +95,7 @@ impl FrameUniforms {
                 shadow.size as f32,
             ],
             shadow_ground_plane: vec4_of(light_box.ground.into(), light_box.texel_side(f64::from(shadow.size))),
+            occlusion_sphere: vec4_of(bounds.center().coords, occlusion_reach.powi(2).min(MAX_SQUARED_REACH)),
             edges: params.edges.map_or([0.0; 4], |edges| color(edges.color, edges.width.into())),
         };
         let numbers: &[f32] = bytemuck::cast_slice(std::slice::from_ref(&frame));

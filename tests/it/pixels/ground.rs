@@ -20,7 +20,7 @@ fn test_scene(modify_look: impl FnOnce(&mut RenderSettings)) -> Arc<Scene> {
     let look = &mut builder.parts.look;
     (look.zenith, look.horizon) = ([0.1, 0.3, 0.8], [0.7, 0.8, 0.9]);
     look.sun = [2.0, 3.0, 1.0];
-    look.ground = Some(Ground { color: [0.5, 0.4, 0.3] });
+    look.ground = Some(Ground { color: Some([0.5, 0.4, 0.3]) });
     modify_look(look);
     let leaf_material = builder.create_leaf_material();
     let builder = builder

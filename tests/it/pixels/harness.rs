@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use modalcast_compute::reference::ReferenceDeformer;
-use modalcast_model::deform::{DeformSummary, Deformer as _};
+use modalcast_model::deform::{DeformSummary, DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Domain, Material, Mesh, Modes, Shape, Texture};
 use modalcast_model::scene::{Camera, Lens, Scene, SceneParts, SceneState, View};
 use modalcast_render::{Allocation, DevicePreference, FrameImage, FrameParams, FrameStats, Renderer};
@@ -124,14 +124,38 @@ pub(super) fn render_sized(
     renderer: &mut Renderer,
     scene: &Arc<Scene>,
     camera: Camera,
+    size: [u32; 2],
+) -> RenderedFrame {
+    render_surface(renderer, scene, camera, size, |_| ())
+}
+
+/// As [`render_sized`], with this normal at every corner.
+pub(super) fn render_with_normals(
+    renderer: &mut Renderer,
+    scene: &Arc<Scene>,
+    camera: Camera,
+    size: [u32; 2],
+    normal: [f32; 3],
+) -> RenderedFrame {
+    render_surface(renderer, scene, camera, size, |surface| surface.normals.as_chunks_mut().0.fill(normal))
+}
+
+/// Renders the scene at rest with a changed surface.
+fn render_surface(
+    renderer: &mut Renderer,
+    scene: &Arc<Scene>,
+    camera: Camera,
     [width, height]: [u32; 2],
+    change: impl FnOnce(&mut DeformedSurface),
 ) -> RenderedFrame {
     // The bounds along the axes of the light are the bounds in light space, to which the shadow map is fitted.
     let mut deformer = ReferenceDeformer::new(scene).with_bounding_axes(scene.light_axes());
     let DeformSummary { bounds, oriented_bounds: light_bounds, .. } =
         deformer.deform(&SceneState::rest(scene)).expect("expected the step to succeed");
     let buffers = renderer.load(scene).expect("expected the scene to load");
-    renderer.upload(&buffers, deformer.surface().expect("expected a surface")).expect("expected the upload to succeed");
+    let mut surface = deformer.surface().expect("expected a surface").clone();
+    change(&mut surface);
+    renderer.upload(&buffers, &surface).expect("expected the upload to succeed");
     let params = FrameParams { camera, width, height, bounds, light_bounds, edges: None, samples: None };
     let image = renderer.draw(&buffers, &params).expect("expected a frame");
     let (stats, allocations) = (renderer.stats().clone(), buffers.allocations());

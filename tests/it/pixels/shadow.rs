@@ -13,7 +13,7 @@ use super::harness::{
 pub(super) fn create_builder() -> SceneBuilder {
     let mut builder = SceneBuilder::new();
     builder.parts.look.sun = [0.0, 1.0, 0.0];
-    builder.parts.look.ground = Some(Ground { color: [0.8; 3] });
+    builder.parts.look.ground = Some(Ground { color: Some([0.8; 3]) });
     builder.parts.look.shadow = Some(ShadowSettings { size: 512, bleeding: 0.0, ..ShadowSettings::default() });
     // Two small squares outside the image of `render_from_above`. Their lower edges set the height of the ground to 0.
     // They extend the bounds to -5.1 and 5.1 in x and to -5 and 5 in z.

@@ -60,7 +60,7 @@ impl LayerScene {
         (look.sun, look.shadow) = (self.rotate([0.0, 1.0, 0.0]).map(|value| value as f32), Some(self.shadow));
         // Little skylight: a level in the shadow is a small fraction of the sunlight.
         (look.sunlight, look.skylight) = ([0.95; 3], [0.05; 3]);
-        look.ground = self.has_ground.then_some(Ground { color: [0.8; 3] });
+        look.ground = self.has_ground.then_some(Ground { color: Some([0.8; 3]) });
         // With a ground, a small floor outside the image sets the height of the ground.
         let floor = Layer { height: 0.0, angle: 0.0, offset: if self.has_ground { -5.8 } else { 6.0 } };
         for layer in std::iter::once(&floor).chain(&self.layers) {

@@ -16,7 +16,7 @@ use super::skin;
 use super::texture::TextureLoader;
 use crate::domain::{Attachment, CreaseAngle, Domain, Shape, Transform};
 use crate::error::{Result, invalid};
-use crate::scene::{MAX_DOMAINS, NormalMethod, SceneParts};
+use crate::scene::{Lighting, MAX_DOMAINS, NormalMethod, SceneParts};
 
 /// The domain to which the domains of a node's children are attached: the first domain of the node or, if the node has
 /// none, of its nearest ancestor with domains.
@@ -209,6 +209,7 @@ impl GltfAssembler<'_> {
     }
 
     fn into_parts(mut self, name: &str, is_strict: bool) -> Result<SceneParts> {
+        let has_materials = self.material_converter.has_materials();
         let mut parts = SceneParts {
             shapes: self.shapes,
             materials: self.material_converter.materials,
@@ -217,6 +218,9 @@ impl GltfAssembler<'_> {
             unit: Some(1.0),
             ..SceneParts::named(name)
         };
+        if !has_materials {
+            parts.look = Lighting::Studio.settings();
+        }
         if self.has_target_normals {
             parts.deformation.normals = NormalMethod::Exact;
             self.remarks

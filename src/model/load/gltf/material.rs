@@ -161,6 +161,11 @@ impl<'a> MaterialConverter<'a> {
         Ok(self.materials.len() - 1)
     }
 
+    /// Whether a primitive has had a material of the document, not the default one.
+    pub(super) fn has_materials(&self) -> bool {
+        self.material_indices.keys().any(|(material, _)| material.is_some())
+    }
+
     fn convert_to_phong(
         &mut self,
         source: &document::Material,

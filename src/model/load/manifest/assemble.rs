@@ -15,7 +15,7 @@ use crate::load::SceneDescription;
 use crate::load::asset_dir::AssetDir;
 use crate::load::surface::{ModelOptions, ModesSource};
 use crate::load::{modes, source, texture_cache};
-use crate::scene::{LengthUnit, MAX_DOMAINS, NormalMethod, PresetRequest, SceneParts, UpAxis};
+use crate::scene::{LengthUnit, Lighting, MAX_DOMAINS, NormalMethod, PresetRequest, SceneParts, UpAxis};
 
 /// Number of parent vertices that carry the domains of an entry without `parent_vertices`.
 const DEFAULT_ATTACHMENT_VERTICES: usize = 8;
@@ -55,7 +55,7 @@ pub(super) fn assemble(
     parts.unit = manifest.unit.map(LengthUnit::meters).or(parts.unit);
     parts.origin = manifest.origin;
     parts.look = match &manifest.look {
-        Some(keys) => keys.render_settings(),
+        Some(keys) => keys.render_settings(&parts.look),
         None => parts.look.with_preset(PresetRequest::default()),
     };
     parts.deformation = manifest.deform.deformation_settings(parts.deformation.normals);
@@ -66,7 +66,12 @@ pub(super) fn assemble(
     }
     match manifest.ground {
         Some(false) => parts.look.ground = None,
-        Some(true) => parts.look.ground = Some(parts.look.ground.unwrap_or_default()),
+        Some(true) => parts.look.ground = parts.look.ground.or(parts.look.lighting.settings().ground),
+        None => {}
+    }
+    match manifest.ambient_occlusion {
+        Some(false) => parts.look.ambient_occlusion = None,
+        Some(true) => parts.look.ambient_occlusion = Some(parts.look.ambient_occlusion.unwrap_or_default()),
         None => {}
     }
     parts.rigid_transforms = manifest.transforms == TransformKind::Rigid;
@@ -171,6 +176,9 @@ impl ManifestAssembler<'_> {
         }
         if entry_index == 0 {
             (self.parts.up, self.parts.unit, self.parts.look) = (model.up, model.unit, model.look);
+        } else if model.look.lighting == Lighting::Outdoor && self.parts.look.lighting == Lighting::Studio {
+            // Models with materials of their own are drawn outdoors, and with them those without.
+            self.parts.look = model.look;
         }
         if model.deformation.normals == NormalMethod::Exact {
             self.parts.deformation.normals = NormalMethod::Exact;

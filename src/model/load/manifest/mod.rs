@@ -39,6 +39,7 @@ struct Manifest {
     look: Option<LookKeys>,
     shadows: Option<bool>,
     ground: Option<bool>,
+    ambient_occlusion: Option<bool>,
     #[serde(default)]
     deform: DeformKeys,
     #[serde(default)]
@@ -95,7 +96,7 @@ struct DomainEntry {
 }
 
 /// Reads the manifest `file` in the folder `files`. `default_name` is the name of a scene whose manifest has none. The
-/// unit and the up axis of `options` replace those of the manifest.
+/// unit, the up axis and the lighting of `options` replace those of the manifest.
 ///
 /// # Errors
 /// `Invalid` with the manifest, the line or entry, and the expected and given value.
@@ -109,6 +110,9 @@ pub(super) fn read(
     let bytes = files.read(file, MAX_MANIFEST_BYTES)?;
     let mut manifest = parse(&bytes).map_err(|error| error.prefix_field(&location))?;
     (manifest.unit, manifest.up) = (options.unit.or(manifest.unit), options.up.or(manifest.up));
+    if let Some(lighting) = options.lighting {
+        manifest.look.get_or_insert_default().lighting = Some(lighting);
+    }
     let entries = take_entries(&mut manifest).map_err(|error| error.prefix_field(&location))?;
     let files = if manifest.strict { &files.strict() } else { files };
     assemble::assemble(files, &manifest, &entries, default_name).map_err(|error| error.prefix_field(&location))

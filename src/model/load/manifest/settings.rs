@@ -8,9 +8,9 @@ use serde::de::{Deserializer, Error, MapAccess, Visitor};
 
 use crate::backend_settings::{BatchPolicy, RasterPolicy};
 use crate::scene::{
-    Antialiasing, Bloom, Culling, DeformationSettings, Ground, LookOverrides, LookPreset, MeshEdges, MomentFormat,
-    NormalMethod, PresetRequest, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
-    Transparency,
+    AmbientOcclusion, Antialiasing, Bloom, Culling, DeformationSettings, Ground, Lighting, LookOverrides, LookPreset,
+    MeshEdges, MomentFormat, NormalMethod, PresetRequest, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings,
+    StorageType, ToneMapping, Transparency,
 };
 
 /// The value of the key `look`: a table, or the name of a preset instead of a table with the key `preset` only.
@@ -74,18 +74,27 @@ impl ShadowKeys {
     }
 }
 
-/// The table `look`. A missing key has the value of a preset or the default of [`RenderSettings`].
+/// The table `look.ground`.
+#[derive(Debug, Clone, Copy, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
+struct GroundKeys {
+    color: Option<[f32; 3]>,
+}
+
+/// The table `look`. A missing key has the value of a preset, or of the lighting ([`Lighting::settings`]).
 #[derive(Debug, Default, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct LookKeys {
     preset: Option<LookPreset>,
+    pub(super) lighting: Option<Lighting>,
     sun: Option<[f32; 3]>,
     sunlight: Option<[f32; 3]>,
     skylight: Option<[f32; 3]>,
     zenith: Option<[f32; 3]>,
     horizon: Option<[f32; 3]>,
     shadow: Option<ShadowKeys>,
-    ground: Option<Ground>,
+    ground: Option<GroundKeys>,
+    ambient_occlusion: Option<AmbientOcclusion>,
     edges: Option<MeshEdges>,
     samples: Option<u32>,
     antialias: Option<Antialiasing>,
@@ -103,18 +112,22 @@ pub(super) struct LookKeys {
 }
 
 impl LookKeys {
-    /// The settings of the scene.
-    pub(super) fn render_settings(&self) -> RenderSettings {
-        let default = RenderSettings::default();
+    /// The settings of the scene. `models`: those of its models, which determine the lighting if no key does.
+    pub(super) fn render_settings(&self, models: &RenderSettings) -> RenderSettings {
+        let default = self.lighting.unwrap_or(models.lighting).settings();
+        let ground =
+            self.ground.map(|keys| Ground { color: keys.color.or(default.ground.and_then(|ground| ground.color)) });
         let settings = RenderSettings {
             preset: None,
+            lighting: default.lighting,
             sun: self.sun.unwrap_or(default.sun),
             sunlight: self.sunlight.unwrap_or(default.sunlight),
             skylight: self.skylight.unwrap_or(default.skylight),
             zenith: self.zenith.unwrap_or(default.zenith),
             horizon: self.horizon.unwrap_or(default.horizon),
             shadow: self.shadow.map_or(default.shadow, |keys| Some(keys.settings())),
-            ground: self.ground.or(default.ground),
+            ground: ground.or(default.ground),
+            ambient_occlusion: self.ambient_occlusion.or(default.ambient_occlusion),
             edges: self.edges.or(default.edges),
             samples: self.samples.unwrap_or(default.samples),
             antialias: self.antialias.unwrap_or(default.antialias),

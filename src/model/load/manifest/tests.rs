@@ -4,8 +4,8 @@ use super::*;
 use crate::backend_settings::{BackendSettings, BatchPolicy, RasterPolicy};
 use crate::domain::{AlphaMode, Transform};
 use crate::scene::{
-    Antialiasing, Bloom, Culling, DeformationSettings, LookOverrides, LookPreset, MomentFormat, NormalMethod,
-    PresetRequest, RenderSettings, SceneParts, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
+    AmbientOcclusion, Antialiasing, Bloom, Culling, DeformationSettings, LookOverrides, LookPreset, MomentFormat,
+    NormalMethod, PresetRequest, RenderSettings, SceneParts, ShadowMethod, ShadowSettings, StorageType, ToneMapping,
 };
 
 const TRIANGLE: &str = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n";
@@ -36,6 +36,24 @@ fn read_manifest(toml: &str) -> Result<SceneDescription> {
 
 fn read_parts(toml: &str) -> Result<SceneParts> {
     read_manifest(toml).map(|description| description.parts)
+}
+
+#[test]
+fn ambient_occlusion_is_removed_or_set_by_a_key() {
+    let radius = |keys: &str| {
+        let parts = read_parts(&format!("model = 'a.obj'\n{keys}\n")).unwrap_or_else(|error| panic!("{keys}: {error}"));
+        parts.look.ambient_occlusion.map(|occlusion| occlusion.radius)
+    };
+    let default = AmbientOcclusion::default().radius;
+    for (keys, expected) in [
+        ("look.lighting = 'studio'", Some(default)),
+        ("look.lighting = 'outdoor'", None),
+        ("ambient_occlusion = false\nlook.lighting = 'studio'", None),
+        ("ambient_occlusion = true\nlook.lighting = 'outdoor'", Some(default)),
+        ("look = { lighting = 'studio', ambient_occlusion = { radius = 0.5 } }", Some(0.5)),
+    ] {
+        assert_eq!(radius(keys), expected, "{keys}");
+    }
 }
 
 /// Some keys and values differ from the names in Rust: `splits` is the number of cascades, the method "filtered" is

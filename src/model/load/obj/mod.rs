@@ -14,7 +14,7 @@ use super::surface::{self, ModelOptions};
 use super::texture_cache::TextureCache;
 use crate::domain::Material;
 use crate::error::{Result, invalid};
-use crate::scene::SceneParts;
+use crate::scene::{Lighting, SceneParts};
 
 /// The largest number of material names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
@@ -30,7 +30,9 @@ const MAX_LISTED_UNDEFINED: usize = 8;
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let obj = parse_file(files, name)?;
     let mut parts = SceneParts::named(stem_of(name));
-    add_materials(&obj, files, &mut parts)?;
+    if !add_materials(&obj, files, &mut parts)? {
+        parts.look = Lighting::Studio.settings();
+    }
     surface::add_domain(files, name, &obj.polygons, options, None, &mut parts)?;
     Ok(parts)
 }
@@ -58,11 +60,11 @@ pub(super) fn parse_obj(text: &str) -> super::polygons::PolygonMesh {
 /// textures.
 ///
 /// A material without definition is [`Material::unspecified`], and a library or image that is not found is left out.
-/// In strict mode, each of these cases is an error.
+/// In strict mode, each of these cases is an error. Returns whether the libraries define materials.
 ///
 /// # Errors
 /// `Invalid` with the material and the statement.
-pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut SceneParts) -> Result<()> {
+pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut SceneParts) -> Result<bool> {
     let mut texture_cache = TextureCache::default();
     let mut statements_by_name = BTreeMap::new();
     let mut has_all_libraries = true;
@@ -122,7 +124,7 @@ pub(super) fn add_materials(obj: &ObjFile, files: &AssetDir, parts: &mut ScenePa
         ));
     }
     parts.textures.append(&mut texture_cache.into_textures());
-    Ok(())
+    Ok(!statements_by_name.is_empty())
 }
 
 /// The references to files in an `mtllib` statement. The statement is one reference if a file has its name, because file

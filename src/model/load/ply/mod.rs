@@ -14,7 +14,7 @@ use super::values::{CorrectedValue, Corrections};
 use crate::domain::{AlphaMode, Material};
 use crate::error::{Result, invalid};
 use crate::load::obj::DEFAULT_ALPHA_CUTOFF;
-use crate::scene::{SceneParts, UpAxis};
+use crate::scene::{Lighting, SceneParts, UpAxis};
 use element::{PlyFace, PlyVertex, Skipped};
 use header::PlyHeader;
 use reader::ElementReader;
@@ -25,7 +25,7 @@ use reader::ElementReader;
 /// `Invalid` with the file, the element, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let in_file = |error: crate::error::Error| error.prefix_field(&format!("file '{name}'"));
-    let mut parts = SceneParts { up: UpAxis::Z, ..SceneParts::named(stem_of(name)) };
+    let mut parts = SceneParts { up: UpAxis::Z, look: Lighting::Studio.settings(), ..SceneParts::named(stem_of(name)) };
     let mut ply = PlyReader::default();
     let content = files.read(name, MAX_MODEL_BYTES)?;
     ply.polygons.memory = files.reserve_polygons(name, content.len())?;

@@ -101,7 +101,7 @@ class SceneInfo(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ...) -> None: ...
 
 class Lighting(_message.Message):
-    __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping")
+    __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping", "ambient_cube", "fill", "ambient_occlusion_radius")
     TO_SUN_FIELD_NUMBER: _ClassVar[int]
     SUNLIGHT_FIELD_NUMBER: _ClassVar[int]
     SKYLIGHT_FIELD_NUMBER: _ClassVar[int]
@@ -111,6 +111,9 @@ class Lighting(_message.Message):
     SHADOWS_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_FIELD_NUMBER: _ClassVar[int]
     TONE_MAPPING_FIELD_NUMBER: _ClassVar[int]
+    AMBIENT_CUBE_FIELD_NUMBER: _ClassVar[int]
+    FILL_FIELD_NUMBER: _ClassVar[int]
+    AMBIENT_OCCLUSION_RADIUS_FIELD_NUMBER: _ClassVar[int]
     to_sun: _containers.RepeatedScalarFieldContainer[float]
     sunlight: _containers.RepeatedScalarFieldContainer[float]
     skylight: _containers.RepeatedScalarFieldContainer[float]
@@ -120,7 +123,10 @@ class Lighting(_message.Message):
     shadows: bool
     exposure: float
     tone_mapping: ToneMapping
-    def __init__(self, to_sun: _Optional[_Iterable[float]] = ..., sunlight: _Optional[_Iterable[float]] = ..., skylight: _Optional[_Iterable[float]] = ..., zenith: _Optional[_Iterable[float]] = ..., horizon: _Optional[_Iterable[float]] = ..., ground: _Optional[_Iterable[float]] = ..., shadows: bool = ..., exposure: _Optional[float] = ..., tone_mapping: _Optional[_Union[ToneMapping, str]] = ...) -> None: ...
+    ambient_cube: _containers.RepeatedScalarFieldContainer[float]
+    fill: _containers.RepeatedScalarFieldContainer[float]
+    ambient_occlusion_radius: float
+    def __init__(self, to_sun: _Optional[_Iterable[float]] = ..., sunlight: _Optional[_Iterable[float]] = ..., skylight: _Optional[_Iterable[float]] = ..., zenith: _Optional[_Iterable[float]] = ..., horizon: _Optional[_Iterable[float]] = ..., ground: _Optional[_Iterable[float]] = ..., shadows: bool = ..., exposure: _Optional[float] = ..., tone_mapping: _Optional[_Union[ToneMapping, str]] = ..., ambient_cube: _Optional[_Iterable[float]] = ..., fill: _Optional[_Iterable[float]] = ..., ambient_occlusion_radius: _Optional[float] = ...) -> None: ...
 
 class UploadSceneRequest(_message.Message):
     __slots__ = ("header", "file", "chunk")
