@@ -17,6 +17,7 @@ const WORKLOAD_HELP: &str = "Loads:
   layers       the shadow of three sheets above each other whose edges cross
   panes        three translucent panes, listed in the wrong order
   images       panels with images of many sizes, each repeated
+  bracket      a bracket with ribs, with studio lighting and ambient occlusion
   tree, grove  the built-in tree, and four of them
   triangles-N  a rolling field of about N triangles with poles on it
   plants, plant-1 .. plant-12

@@ -79,6 +79,7 @@ mod tests {
             faults: Vec::new(),
             color_errors: ErrorDistribution::default(),
             intended_color_errors: ErrorDistribution::default(),
+            surface_color_errors: ErrorDistribution::default(),
             light_errors: LightErrors::default(),
             intended_light_errors: LightErrors::default(),
             flicker: None,

@@ -1,4 +1,5 @@
-//! Sections of `report.md` that cover all workloads: minimal passes, rasterizers, blurs, and the plants of the thesis.
+//! Sections of `report.md` that cover all workloads: antialiasing, ambient occlusion, minimal passes, rasterizers,
+//! blurs, and the plants of the thesis.
 
 use super::blur_comparison::{BlurComparison, MAX_COMPUTE_US, MIN_SPEEDUP};
 use super::minimal_passes::{MAX_EXCESS_US, MinimalPasses};
@@ -11,6 +12,7 @@ use crate::markdown_table::{dash, table};
 pub(super) fn markdown(report: &RenderReport) -> String {
     [
         antialias_section(&report.rows),
+        occlusion_section(&report.rows),
         minimal_passes_section(&report.minimal_passes),
         raster_section(&report.raster),
         blur_section(&report.blurs),
@@ -41,6 +43,35 @@ fn antialias_section(rows: &[RenderRow]) -> String {
     };
     let table = table(&header, rows.map(cells));
     format!("\n## Antialiasing\n\nWithout shadows; color errors against the ray-cast reference, of 255.\n\n{table}")
+}
+
+/// Images with and without ambient occlusion. Only images within their limits are timed.
+fn occlusion_section(rows: &[RenderRow]) -> String {
+    let mut rows = rows.iter().filter(|row| row.error_limits.mean_surface_color.is_some()).peekable();
+    if rows.peek().is_none() {
+        return String::new();
+    }
+    let header = ["load", "variant", "frame us", "occlusion us", "color mean", "p99", "largest", "flicker mean", "MB"];
+    let cells = |row: &RenderRow| {
+        let errors = row.surface_color_errors;
+        let occlusion = row.passes.iter().find(|pass| pass.name == "ambient occlusion");
+        [
+            row.load.clone(),
+            row.name.clone(),
+            row.median_us().map_or_else(dash, |us| format!("{us:.1}")),
+            occlusion.map_or_else(dash, |pass| format!("{:.1}", pass.timing.median_us)),
+            format!("{:.3}", errors.mean),
+            format!("{:.1}", errors.p99),
+            format!("{:.1}", errors.max),
+            row.flicker.map_or_else(dash, |flicker| format!("{:.3}", flicker.mean)),
+            format!("{:.1}", row.bytes as f64 / 1e6),
+        ]
+    };
+    let table = table(&header, rows.map(cells));
+    format!(
+        "\n## Ambient occlusion\n\nWithout shadows; color errors of the pixels that show triangles against rays over \
+         the hemisphere, of 255.\n\n{table}"
+    )
 }
 
 fn minimal_passes_section(rows: &[MinimalPasses]) -> String {

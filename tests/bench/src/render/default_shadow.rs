@@ -204,6 +204,7 @@ mod tests {
             faults: vec![],
             color_errors: ErrorDistribution::default(),
             intended_color_errors: ErrorDistribution::default(),
+            surface_color_errors: ErrorDistribution::default(),
             light_errors: LightErrors { all_pixels, ..LightErrors::default() },
             intended_light_errors: LightErrors::default(),
             flicker: None,

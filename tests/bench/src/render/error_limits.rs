@@ -12,6 +12,8 @@ use modalcast_model::scene::Transparency;
 pub struct ErrorLimits {
     /// Mean color error of a pixel, of 255.
     pub mean_color: f64,
+    /// Mean color error of a pixel that shows a triangle, of 255; `None` without such a limit.
+    pub mean_surface_color: Option<f64>,
     /// Mean error of the sun visibility, of 1.
     pub mean_light: f64,
     /// Mean sun visibility inside the umbra (light bleeding), of 1.
@@ -22,6 +24,15 @@ pub struct ErrorLimits {
 }
 
 impl ErrorLimits {
+    /// No limits.
+    const NONE: Self = Self {
+        mean_color: f64::INFINITY,
+        mean_surface_color: None,
+        mean_light: f64::INFINITY,
+        bleeding: f64::INFINITY,
+        lost_visibility: f64::INFINITY,
+    };
+
     /// The limits of a variant on a workload: 1.5 times the largest error of all variants, which llvmpipe drew with
     /// 640x360 pixels, against references of 64 samples per pixel. Larger images should have smaller errors, because fewer
     /// of their pixels lie on edges. On the grove and the field (300,000 triangles), 23 variants were measured, among them
@@ -33,6 +44,7 @@ impl ErrorLimits {
     ///   cascades at 1920x1080 on an H200 (0.077; 0.075 by llvmpipe).
     /// - `lost_visibility` of tree and grove: 1.5 times the errors of llvmpipe (0.0022 and 0.012) with an earlier form of
     ///   the fallback to filtered depths, which lost more. The tree has 0.0018 at 1920x1080 on an H200.
+    /// - Bracket: less than the error of an image without ambient occlusion.
     pub(super) fn of(variant: &RenderVariant, workload: RenderWorkload) -> Self {
         let limits = Self::of_workload(workload);
         let has_bleeding_reduction = variant.shadow.is_none_or(|shadow| shadow.bleeding > 0.0);
@@ -62,36 +74,44 @@ impl ErrorLimits {
         match workload {
             // Edges without antialiasing; a map of 256 texels with a blur of 4.
             RenderWorkload::Square => {
-                Self { mean_color: 0.9, mean_light: 0.0036, bleeding: 0.0013, lost_visibility: 0.0003 }
+                Self { mean_color: 0.9, mean_light: 0.0036, bleeding: 0.0013, lost_visibility: 0.0003, ..Self::NONE }
             }
             // Its shadow fills half of the image and is narrower than the widest blur, so most of the sunlight leaks
             // into the shadow. Texels of standard maps of 256 shade the ground.
             RenderWorkload::Shelf => {
-                Self { mean_color: 13.0, mean_light: 0.385, bleeding: 0.123, lost_visibility: 0.185 }
+                Self { mean_color: 13.0, mean_light: 0.385, bleeding: 0.123, lost_visibility: 0.185, ..Self::NONE }
             }
             // The image is as wide as 26 texels of a map of 256: a blur of 4 shades all of it, and the reduction of
             // light bleeding moves edges by a texel. Texels of a standard map of 256 cover a part of the lit wedge.
             RenderWorkload::Layers => {
-                Self { mean_color: 8.1, mean_light: 0.045, bleeding: 0.0084, lost_visibility: 0.115 }
+                Self { mean_color: 8.1, mean_light: 0.045, bleeding: 0.0084, lost_visibility: 0.115, ..Self::NONE }
             }
             RenderWorkload::Panes => {
-                Self { mean_color: 1.2, mean_light: 0.0094, bleeding: 0.0013, lost_visibility: 0.0003 }
+                Self { mean_color: 1.2, mean_light: 0.0094, bleeding: 0.0013, lost_visibility: 0.0003, ..Self::NONE }
             }
             // Differences of filtering between the texture units and the reference.
             RenderWorkload::Images => {
-                Self { mean_color: 5.9, mean_light: 0.0001, bleeding: 0.0001, lost_visibility: 0.0001 }
+                Self { mean_color: 5.9, mean_light: 0.0001, bleeding: 0.0001, lost_visibility: 0.0001, ..Self::NONE }
             }
+            // Differences between horizon angles in the image and rays in the scene. There are no shadows.
+            RenderWorkload::Bracket => Self {
+                mean_color: 3.0,
+                mean_surface_color: Some(3.0),
+                mean_light: 0.0001,
+                bleeding: 0.0001,
+                lost_visibility: 0.0001,
+            },
             // Leaves of a pixel or two: without antialiasing, a pixel shows one of several leaves.
             RenderWorkload::Tree => {
-                Self { mean_color: 5.4, mean_light: 0.08, bleeding: 0.075, lost_visibility: 0.0033 }
+                Self { mean_color: 5.4, mean_light: 0.08, bleeding: 0.075, lost_visibility: 0.0033, ..Self::NONE }
             }
             // Four trees in an image of the same size have smaller leaves.
             RenderWorkload::Grove => {
-                Self { mean_color: 11.6, mean_light: 0.195, bleeding: 0.163, lost_visibility: 0.018 }
+                Self { mean_color: 11.6, mean_light: 0.195, bleeding: 0.163, lost_visibility: 0.018, ..Self::NONE }
             }
             // Poles cast thin shadows, which a map of 256 texels with a blur of 4 widens.
             RenderWorkload::Triangles(_) => {
-                Self { mean_color: 1.5, mean_light: 0.022, bleeding: 0.03, lost_visibility: 0.0096 }
+                Self { mean_color: 1.5, mean_light: 0.022, bleeding: 0.03, lost_visibility: 0.0096, ..Self::NONE }
             }
         }
     }

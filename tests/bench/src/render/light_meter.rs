@@ -28,7 +28,7 @@ pub(super) fn meter_scene(scene: &Scene) -> Result<Arc<Scene>> {
         skylight: [0.0; 3],
         zenith: [0.0; 3],
         horizon: [0.0; 3],
-        ground: scene.look.ground.map(|_| Ground { color: [1.0; 3] }),
+        ground: scene.look.ground.map(|_| Ground { color: Some([1.0; 3]) }),
         ..scene.look
     };
     let mut parts = SceneParts { look, ..scene.parts() };

@@ -63,6 +63,9 @@ pub struct RenderRow {
     /// Color errors against the intended result.
     #[serde(rename = "color_of_aim")]
     pub intended_color_errors: ErrorDistribution,
+    /// Color errors against the intended result, of the pixels that show triangles.
+    #[serde(rename = "color_of_surfaces")]
+    pub surface_color_errors: ErrorDistribution,
     /// Errors of the sun visibility against the reference with hard shadows.
     #[serde(rename = "light")]
     pub light_errors: LightErrors,
@@ -420,9 +423,12 @@ impl WorkloadContext<'_> {
     ) -> RenderRow {
         let hard_image = &self.references.hard_image;
         let intended_color_errors = metrics::compare_colors(&image.rgba, &reference.colors);
+        let surface_color_errors =
+            metrics::compare_colors_where(&image.rgba, &reference.colors, &reference.shows_triangle);
         let intended_light_errors = metrics::compare_light(sun_visibility, &reference.sun_visibility);
         let error_limits = ErrorLimits::of(variant, self.animation.workload);
-        let faults = exceeded_limits(&intended_color_errors, &intended_light_errors, &error_limits);
+        let color_errors = [&intended_color_errors, &surface_color_errors];
+        let faults = exceeded_limits(color_errors, &intended_light_errors, &error_limits);
         RenderRow {
             load: self.animation.name.clone(),
             name: variant.name.clone(),
@@ -437,6 +443,7 @@ impl WorkloadContext<'_> {
             faults,
             color_errors: metrics::compare_colors(&image.rgba, &hard_image.colors),
             intended_color_errors,
+            surface_color_errors,
             light_errors: metrics::compare_light(sun_visibility, &hard_image.sun_visibility),
             intended_light_errors,
             flicker: None,
@@ -496,10 +503,16 @@ impl WorkloadContext<'_> {
     }
 }
 
-/// Messages about exceeded limits.
-fn exceeded_limits(color: &ErrorDistribution, light: &LightErrors, limits: &ErrorLimits) -> Vec<String> {
+/// Messages about exceeded limits. The color errors are those of all pixels, and of the pixels that show triangles.
+fn exceeded_limits(
+    [color, surface_color]: [&ErrorDistribution; 2],
+    light: &LightErrors,
+    limits: &ErrorLimits,
+) -> Vec<String> {
+    let surface_limit = limits.mean_surface_color.unwrap_or(f64::INFINITY);
     let errors = [
         ("mean color error", Some(color.mean), limits.mean_color),
+        ("mean color error of surfaces", Some(surface_color.mean), surface_limit),
         ("mean sun visibility error", Some(light.all_pixels.mean), limits.mean_light),
         ("mean sun visibility in the umbra", light.umbra_visibility, limits.bleeding),
         ("mean sun visibility lost outside of shadows", light.lost_visibility, limits.lost_visibility),
@@ -524,7 +537,7 @@ mod tests {
     /// The messages about an image with exact colors and this sun visibility.
     fn find_faults(visibility: &[Option<f32>], limits: &ErrorLimits) -> Vec<String> {
         let light_errors = metrics::compare_light(visibility, &visibility_with_shadow(100));
-        exceeded_limits(&ErrorDistribution::default(), &light_errors, limits)
+        exceeded_limits([&ErrorDistribution::default(); 2], &light_errors, limits)
     }
 
     #[test]
@@ -543,6 +556,21 @@ mod tests {
         let dark = faults(&vec![Some(0.5); 1000]);
         assert!(dark.iter().any(|message| message.starts_with("mean sun visibility lost")));
         let undefined = ErrorDistribution { mean: f64::NAN, ..ErrorDistribution::default() };
-        assert_eq!(exceeded_limits(&undefined, &LightErrors::default(), &limits).len(), 1, "NaN exceeds every limit");
+        let colors = [&undefined, &ErrorDistribution::default()];
+        assert_eq!(exceeded_limits(colors, &LightErrors::default(), &limits).len(), 1, "NaN exceeds every limit");
+    }
+
+    #[test]
+    fn bracket_alone_has_a_limit_of_surfaces() {
+        let wrong_surfaces = ErrorDistribution { mean: 3.5, ..ErrorDistribution::default() };
+        for workload in RenderWorkload::all(false) {
+            let colors = [&ErrorDistribution::default(), &wrong_surfaces];
+            let faults = exceeded_limits(colors, &LightErrors::default(), &ErrorLimits::of_workload(workload));
+            let expected: &[&str] = match workload {
+                RenderWorkload::Bracket => &["mean color error of surfaces: expected at most 3, got 3.500e0"],
+                _ => &[],
+            };
+            assert_eq!(faults, expected, "{workload:?}");
+        }
     }
 }

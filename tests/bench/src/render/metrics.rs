@@ -38,6 +38,12 @@ pub fn compare_colors(rendered: &[u8], reference: &[[f32; 3]]) -> ErrorDistribut
     ErrorDistribution::from_values(differences(rendered, reference).collect())
 }
 
+/// Color errors of the pixels for which `is_counted` is true.
+pub fn compare_colors_where(rendered: &[u8], reference: &[[f32; 3]], is_counted: &[bool]) -> ErrorDistribution {
+    let errors = differences(rendered, reference).zip(is_counted);
+    ErrorDistribution::from_values(errors.filter_map(|(error, is_counted)| is_counted.then_some(error)).collect())
+}
+
 /// The largest difference of the three color channels, per pixel.
 pub fn differences<'a>(rendered: &'a [u8], reference: &'a [[f32; 3]]) -> impl Iterator<Item = f32> + 'a {
     let largest_difference = |(pixel, expected): (&[u8], &[f32; 3])| {
@@ -147,6 +153,9 @@ mod tests {
         tinted[1] = 90;
         assert_eq!(compare_colors(&tinted, &reference).max, 10.0, "an error in one channel is counted");
         assert_eq!(compare_colors(&[], &[]), ErrorDistribution::default());
+        let is_counted: Vec<bool> = (0..100).map(|pixel| pixel < 10).collect();
+        let counted_errors = compare_colors_where(&one_wrong, &reference, &is_counted);
+        assert_eq!((counted_errors.mean, counted_errors.count), (5.0, 10), "one wrong pixel in ten");
     }
 
     #[test]

@@ -7,9 +7,10 @@
 //!
 //! - [`workloads`], [`variants`]: the scenes, and the ways to draw them.
 //! - `ray_scene`, `reference_material`, `reference_texture`, `reference_view`, `shade`, `sample_pattern`,
-//!   `reference_image`: the references, with 64 samples per pixel, in f64 except for the boxes of the BVH. Each sample
-//!   sees its nearest opaque or cut-out surface and the transparent surfaces in front of it, sorted by depth. Shadows
-//!   are cast by one ray per sample to the sun, or by rays that are distributed over the footprint of the blur.
+//!   `ambient_occlusion`, `reference_image`: the references, with 64 samples per pixel, in f64 except for the boxes of
+//!   the BVH. Each sample sees its nearest opaque or cut-out surface and the transparent surfaces in front of it,
+//!   sorted by depth. Shadows are cast by one ray per sample to the sun, or by rays that are distributed over the
+//!   footprint of the blur. Ambient occlusion is the mean over rays in the hemisphere above the surface.
 //! - `harness`, `light_meter`: draw and time frames of the renderer, and measure their sun visibility.
 //! - `readback`: frames per second when each frame is copied to the host.
 //! - `pipeline`: steps per second with frames in flight, as in the server, and steps that are not drawn.
@@ -26,7 +27,9 @@
 //! - [`figures`]: reproduces figures of the thesis.
 //! - `output`, `markdown`, `comparison_tables`, `raster_report`, `plot`, `image_files`: the files of a report.
 
+mod ambient_occlusion;
 mod blur_comparison;
+mod bracket;
 mod comparison_tables;
 mod default_shadow;
 pub mod error_limits;

@@ -16,6 +16,7 @@ use modalcast_model::error::{Result, fault_in};
 /// joins. Names that do not explain themselves:
 ///
 /// - `color`, `light`: errors against the reference with hard shadows; `light` is the sun visibility
+/// - `of_surfaces`: errors against the intended result, only of the pixels that show triangles
 /// - `of_aim`: errors against the intended result: no shadow, a hard shadow, or a hard shadow with the variant's blur
 /// - `bleeding`, `penumbra`, `lost`: mean sun visibility in the umbra, errors in the penumbra, and mean missing sun
 ///   visibility where there is no shadow; all against the intended result
@@ -23,7 +24,7 @@ use modalcast_model::error::{Result, fault_in};
 /// - `to_fail`: whether the variant is expected to exceed its limits
 /// - `no_flicker`: why flicker was not measured
 /// - `listed`, `hidden`: triangles that are passed to the rasterizer, and triangles that are occluded
-const COLUMNS: [(&str, &str); 56] = [
+const COLUMNS: [(&str, &str); 59] = [
     ("load", "/load"),
     ("variant", "/name"),
     ("method", "/method"),
@@ -43,6 +44,7 @@ const COLUMNS: [(&str, &str); 56] = [
     ("draw_us", "draw"),
     ("cull_us", "cull"),
     ("visibility_us", "visibility"),
+    ("ambient_occlusion_us", "ambient occlusion"),
     ("blended_us", "blended"),
     ("shade_us", "shade"),
     ("bloom_us", "bloom"),
@@ -62,6 +64,8 @@ const COLUMNS: [(&str, &str); 56] = [
     ("color_of_aim_mean", "/color_of_aim/mean"),
     ("color_of_aim_p99", "/color_of_aim/p99"),
     ("color_of_aim_largest", "/color_of_aim/largest"),
+    ("color_of_surfaces_mean", "/color_of_surfaces/mean"),
+    ("color_of_surfaces_p99", "/color_of_surfaces/p99"),
     ("light_mean", "/light/all/mean"),
     ("light_p99", "/light/all/p99"),
     ("light_largest", "/light/all/largest"),
@@ -256,7 +260,8 @@ mod tests {
         }
         let sum_of =
             |names: &[&str]| -> f64 { passes.iter().filter(|pass| names.contains(&pass.0)).map(|pass| pass.1).sum() };
-        let (draw_ms, parts) = (sum_of(&["draw"]), ["cull", "visibility", "blended", "shade", "bloom", "encode"]);
+        let parts = ["cull", "visibility", "ambient occlusion", "blended", "shade", "bloom", "encode"];
+        let draw_ms = sum_of(&["draw"]);
         assert!((draw_ms - sum_of(&parts)).abs() < 1e-9 * draw_ms, "{passes:?}");
         assert!(
             sum_of(&parts[1..]) < draw_ms && sum_of(&["bloom"]) > 0.0,

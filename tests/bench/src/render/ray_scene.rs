@@ -277,14 +277,17 @@ impl RayScene {
 
     /// Whether a hit is opaque: not on the back of a single-sided material, not cut out and not blended.
     pub(super) fn is_opaque(&self, hit: &Hit) -> bool {
+        (hit.is_front || self.material(hit).double_sided) && self.is_solid(hit)
+    }
+
+    /// Whether a hit, from either side, is neither cut out nor blended.
+    pub(super) fn is_solid(&self, hit: &Hit) -> bool {
         let material = self.material(hit);
-        let is_visible_side = hit.is_front || material.double_sided;
-        is_visible_side
-            && match material.alpha_kind {
-                AlphaKind::Opaque => true,
-                AlphaKind::Mask => self.alpha(hit) >= material.alpha_cutoff,
-                AlphaKind::Blend => false,
-            }
+        match material.alpha_kind {
+            AlphaKind::Opaque => true,
+            AlphaKind::Mask => self.alpha(hit) >= material.alpha_cutoff,
+            AlphaKind::Blend => false,
+        }
     }
 
     /// Whether a hit is blended over the surfaces behind it.

@@ -1,9 +1,10 @@
-//! Traces reference images. Every sample of a pixel is ray-cast, transparent layers are sorted, and rays to the sun
-//! determine shadows.
+//! Traces reference images. Every sample of a pixel is ray-cast, and transparent layers are sorted. Rays to the sun
+//! determine shadows, and rays over the hemisphere determine ambient occlusion.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
+use super::ambient_occlusion::ambient_visibility;
 use super::ray_scene::{Ray, RayScene};
 use super::reference_texture::srgb_from_linear;
 use super::reference_view::ReferenceView;
@@ -31,6 +32,8 @@ pub(super) struct ReferenceImage {
     pub(super) colors: Vec<[f32; 3]>,
     /// Sun visibility per pixel; `None` where the unshadowed sunlight is less than [`MIN_SUNLIGHT`].
     pub(super) sun_visibility: Vec<Option<f32>>,
+    /// Whether a sample of the pixel shows a triangle.
+    pub(super) shows_triangle: Vec<bool>,
 }
 
 /// Minimum unshadowed sunlight for which sun visibility is defined, as a fraction of the maximum.
@@ -43,13 +46,16 @@ pub(super) struct SampleCounts {
     pub(super) samples_per_side: usize,
     /// Rays to the sun per sample of a filtered shadow.
     pub(super) taps: usize,
+    /// Rays over the hemisphere per sample, if the scene has ambient occlusion.
+    pub(super) ambient_rays: usize,
 }
 
 impl SampleCounts {
-    /// 64 samples per pixel.
-    pub(super) const FULL: Self = Self { samples_per_side: 8, taps: 1 };
-    /// 16 samples per pixel, for machines with few cores. Filtered shadows still have 16 x 4 = 64 rays per pixel.
-    pub(super) const QUICK: Self = Self { samples_per_side: 4, taps: 4 };
+    /// 64 samples per pixel, with 64 x 16 = 1024 rays per pixel for the ambient occlusion.
+    pub(super) const FULL: Self = Self { samples_per_side: 8, taps: 1, ambient_rays: 16 };
+    /// 16 samples per pixel, for machines with few cores. Filtered shadows still have 16 x 4 = 64 rays per pixel, and
+    /// the ambient occlusion has 16 x 16 = 256.
+    pub(super) const QUICK: Self = Self { samples_per_side: 4, taps: 4, ambient_rays: 16 };
 }
 
 /// Traces one image per shadow model; camera rays are shared.
@@ -60,24 +66,26 @@ pub(super) fn trace_reference_images(
     counts: SampleCounts,
 ) -> Vec<ReferenceImage> {
     let samples = sample_pattern::pixel_samples(counts.samples_per_side);
-    // Per pixel and shadow model: color and sun visibility.
-    let pixels: Vec<Vec<([f32; 3], Option<f32>)>> = (0..view.width * view.height)
+    let pixels: Vec<TracedPixel> = (0..view.width * view.height)
         .into_par_iter()
         .map(|pixel| {
-            trace_pixel(
-                ray_scene,
-                view,
-                shadow_models,
-                (pixel % view.width, pixel / view.width),
-                (&samples, counts.taps),
-            )
+            let position = (pixel % view.width, pixel / view.width);
+            trace_pixel(ray_scene, view, shadow_models, position, (&samples, counts))
         })
         .collect();
     let extract_image = |shadow_model: usize| ReferenceImage {
-        colors: pixels.iter().map(|pixel| pixel[shadow_model].0).collect(),
-        sun_visibility: pixels.iter().map(|pixel| pixel[shadow_model].1).collect(),
+        colors: pixels.iter().map(|pixel| pixel.light[shadow_model].0).collect(),
+        sun_visibility: pixels.iter().map(|pixel| pixel.light[shadow_model].1).collect(),
+        shows_triangle: pixels.iter().map(|pixel| pixel.shows_triangle).collect(),
     };
     (0..shadow_models.len()).map(extract_image).collect()
+}
+
+/// Results of one pixel.
+struct TracedPixel {
+    /// Color and sun visibility with each shadow model.
+    light: Vec<([f32; 3], Option<f32>)>,
+    shows_triangle: bool,
 }
 
 /// Sums over the samples of a pixel with one shadow model.
@@ -90,28 +98,40 @@ struct PixelSum {
     unshadowed: f64,
 }
 
-/// Color and sun visibility of a pixel with each shadow model. `samples` are positions within the pixel, `taps` is the
-/// number of rays to the sun per sample.
+/// Traces a pixel with each shadow model. `samples` are positions within the pixel.
 fn trace_pixel(
     ray_scene: &RayScene,
     view: &ReferenceView,
     shadow_models: &[ShadowModel],
     (x, y): (u32, u32),
-    (samples, taps): (&[[f64; 2]], usize),
-) -> Vec<([f32; 3], Option<f32>)> {
-    let gaussian_samples = sample_pattern::gaussian_samples(samples.len() * taps, sample_pattern::pixel_shift(x, y));
+    (samples, SampleCounts { taps, ambient_rays, .. }): (&[[f64; 2]], SampleCounts),
+) -> TracedPixel {
+    let shift = sample_pattern::pixel_shift(x, y);
+    let gaussian_samples = sample_pattern::gaussian_samples(samples.len() * taps, shift);
+    // No rays without ambient occlusion.
+    let ambient_rays = view.occlusion_radius.map_or(0, |_| ambient_rays);
+    let cosine_samples = sample_pattern::cosine_samples(samples.len() * ambient_rays, shift);
     let mut sums = vec![PixelSum::default(); shadow_models.len()];
+    let mut shows_triangle = false;
     for (index, [dx, dy]) in samples.iter().enumerate() {
-        let layers = trace_layers(ray_scene, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
+        let mut layers = trace_layers(ray_scene, view, &view.ray(f64::from(x) + dx, f64::from(y) + dy));
+        shows_triangle |= layers.iter().any(|layer| layer.triangle.is_some());
         // The number of samples is a power of two, so an odd stride visits all points. With the stride 37, neighboring
         // samples get points that are far from each other. The offset 11 is arbitrary.
-        let sun_samples: Vec<[f64; 2]> =
-            (0..taps).map(|tap| gaussian_samples[((index * 37 + 11) % samples.len()) * taps + tap]).collect();
+        let point_index = (index * 37 + 11) % samples.len();
+        let sun_samples: Vec<[f64; 2]> = (0..taps).map(|tap| gaussian_samples[point_index * taps + tap]).collect();
+        // Only the opaque layer, which is the first, receives ambient occlusion.
+        if ambient_rays > 0 {
+            let directions: Vec<[f64; 3]> =
+                cosine_samples.iter().skip(point_index).step_by(samples.len()).copied().collect();
+            let visibility = ambient_visibility(ray_scene, view, &layers[0], &directions);
+            layers[0].ambient *= visibility;
+        }
         for (sum, shadow_model) in sums.iter_mut().zip(shadow_models) {
             add_sample(sum, &layers, |point| sun_visibility(ray_scene, view, point, *shadow_model, &sun_samples));
         }
     }
-    sums.iter().map(|sum| sum.resolve(samples.len())).collect()
+    TracedPixel { light: sums.iter().map(|sum| sum.resolve(samples.len())).collect(), shows_triangle }
 }
 
 /// The layers along a ray, farthest first: one opaque layer, then every transparent layer in front of it.
@@ -144,7 +164,8 @@ fn add_sample(sum: &mut PixelSum, layers: &[ShadedPoint], visibility: impl Fn(&S
     for point in layers {
         let visibility = if point.cosine > 0.0 { visibility(point) } else { 0.0 };
         let transmittance = 1.0 - point.alpha;
-        sample.color = (point.ambient + point.sun * visibility) * point.alpha + sample.color * transmittance;
+        let light = point.ambient + point.unoccluded + point.sun * visibility;
+        sample.color = light * point.alpha + sample.color * transmittance;
         sample.shadowed = point.cosine * visibility * point.alpha + sample.shadowed * transmittance;
         sample.unshadowed = point.cosine * point.alpha + sample.unshadowed * transmittance;
     }

@@ -17,14 +17,27 @@ pub(super) struct ReferenceView {
     pub(super) depth_range: (f64, f64),
     pub(super) to_sun: Vector3<f64>,
     pub(super) sunlight: Vector3<f64>,
-    pub(super) skylight: Vector3<f64>,
+    /// Fill light at the camera; 0 outdoors.
+    pub(super) fill: Vector3<f64>,
     pub(super) up: Vector3<f64>,
     pub(super) ground: Option<GroundPlane>,
+    /// Radius of the ambient occlusion; `None` without it.
+    pub(super) occlusion_radius: Option<f64>,
+    ambient_light: AmbientLight,
     zenith: Vector3<f64>,
     horizon: Vector3<f64>,
     world_from_camera: Matrix3<f64>,
     /// Focal lengths and principal point [fx, fy, cx, cy] in pixels, from the top left.
     lens: [f64; 4],
+}
+
+/// Ambient light on surfaces.
+#[derive(Debug, Clone, Copy)]
+enum AmbientLight {
+    /// The same on every side.
+    Uniform(Vector3<f64>),
+    /// Ambient cube: the colors of the sides +x, -x, +y, -y, +z and -z.
+    Cube([Vector3<f64>; 6]),
 }
 
 /// The ground: a plane that fades into the horizon.
@@ -55,6 +68,7 @@ impl ReferenceView {
         let eye = frame_params.camera.eye();
         let up_axis = scene.up.index();
         let is_above_ground = eye[up_axis] > scene.rest_bounds.min[up_axis];
+        let studio_light = settings.studio_light(scene.up);
         Self {
             width: frame_params.width,
             height: frame_params.height,
@@ -62,12 +76,18 @@ impl ReferenceView {
             depth_range: if far > 0.0 { (near, far) } else { (0.0, f64::INFINITY) },
             to_sun: settings.to_sun(scene.up),
             sunlight: to_f64(settings.sunlight),
-            skylight: to_f64(settings.skylight),
+            fill: studio_light.map_or(Vector3::zeros(), |light| to_f64(light.fill)),
             up: scene.up.vector(),
             ground: settings
-                .ground
+                .ground_color(scene.up)
                 .filter(|_| is_above_ground)
-                .map(|ground| GroundPlane::new(scene, eye, to_f64(ground.color))),
+                .map(|color| GroundPlane::new(scene, eye, to_f64(color))),
+            occlusion_radius: settings
+                .ambient_occlusion
+                .map(|occlusion| f64::from(occlusion.radius) * scene.rest_bounds.diagonal()),
+            ambient_light: studio_light.map_or(AmbientLight::Uniform(to_f64(settings.skylight)), |light| {
+                AmbientLight::Cube(light.ambient_cube.map(to_f64))
+            }),
             zenith: to_f64(settings.zenith),
             horizon: to_f64(settings.horizon),
             world_from_camera: rotation.try_inverse().unwrap_or_else(Matrix3::identity),
@@ -88,6 +108,16 @@ impl ReferenceView {
         let sine = direction.normalize().dot(&self.up).max(0.0);
         let zenith_weight = 1.0 - (-6.0 * sine * sine / (sine + 0.06)).exp();
         self.horizon.lerp(&self.zenith, zenith_weight)
+    }
+
+    /// The ambient light of a surface with this unit normal.
+    pub(super) fn ambient_light(&self, normal: &Vector3<f64>) -> Vector3<f64> {
+        match self.ambient_light {
+            AmbientLight::Uniform(color) => color,
+            AmbientLight::Cube(sides) => (0..3)
+                .map(|axis| sides[2 * axis + usize::from(normal[axis] < 0.0)] * (normal[axis] * normal[axis]))
+                .sum(),
+        }
     }
 
     /// The parameter t at which a ray hits the ground in front of its origin.

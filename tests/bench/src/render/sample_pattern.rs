@@ -1,4 +1,4 @@
-//! Sample patterns: in a pixel, and of a Gaussian filter.
+//! Sample patterns: in a pixel, of a Gaussian filter, and over a hemisphere.
 
 use std::f64::consts::TAU;
 
@@ -27,6 +27,20 @@ pub(super) fn gaussian_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 2]> {
         [radius * angle.cos(), radius * angle.sin()]
     };
     (0..count).map(point).collect()
+}
+
+/// Cosine-distributed unit vectors around the z axis: a Fibonacci lattice on the unit disk, projected to the
+/// hemisphere. Vectors at equal distances in the list, such as every 64th, also cover the hemisphere evenly. `shift` is
+/// that of [`gaussian_samples`].
+pub(super) fn cosine_samples(count: usize, shift: [f64; 2]) -> Vec<[f64; 3]> {
+    const GOLDEN_RATIO: f64 = 1.618_033_988_749_895;
+    let direction = |index: usize| {
+        let squared_radius = ((index as f64 + 0.5) / count as f64 + shift[0]).fract();
+        let angle = TAU * (index as f64 * (GOLDEN_RATIO - 1.0) + shift[1]);
+        let radius = squared_radius.sqrt();
+        [radius * angle.cos(), radius * angle.sin(), (1.0 - squared_radius).sqrt()]
+    };
+    (0..count).map(direction).collect()
 }
 
 /// Two pseudo-random numbers in [0, 1) per pixel, with the constants of the generator `SplitMix64`.
@@ -72,6 +86,29 @@ mod tests {
                     mean.abs() < 0.03 && (variance - 1.0).abs() < 0.04,
                     "{shift:?}: mean {mean}, variance {variance}"
                 );
+            }
+        }
+    }
+
+    /// For a cosine distribution, the mean of z is 2/3, the mean of z^2 is 1/2 and the means of x and y are 0.
+    #[test]
+    fn cosine_samples_and_their_subsets_have_the_moments_of_a_cosine() {
+        for shift in [[0.0, 0.0], [0.3, 0.9], [0.999, 0.5]] {
+            let directions = cosine_samples(1024, shift);
+            assert!(directions.iter().all(|[x, y, z]| (x * x + y * y + z * z - 1.0).abs() < 1e-12 && *z >= 0.0));
+            // All directions, and those of one of 64 samples.
+            for (step, tolerance) in [(1, 2e-3), (64, 0.06)] {
+                let subset: Vec<&[f64; 3]> = directions.iter().skip(step / 2).step_by(step).collect();
+                let mean = |value: fn(&[f64; 3]) -> f64| {
+                    subset.iter().map(|direction| value(direction)).sum::<f64>() / subset.len() as f64
+                };
+                let errors = [
+                    mean(|direction| direction[0]),
+                    mean(|direction| direction[1]),
+                    mean(|direction| direction[2]) - 2.0 / 3.0,
+                    mean(|direction| direction[2] * direction[2]) - 0.5,
+                ];
+                assert!(errors.iter().all(|error| error.abs() < tolerance), "{shift:?}, every {step}: {errors:?}");
             }
         }
     }

@@ -1,10 +1,12 @@
-//! Phong shading by equation 3.12 of the thesis, as in the shaders but in f64. The radiance towards the eye is split
-//! into an ambient part and a part from the sun.
+//! Phong shading by equation 3.12 of the thesis, as in the shaders but in f64. The radiance towards the eye has three
+//! parts: from the ambient light, from light that is never occluded, and from the sun.
 //!
-//!   C = skylight Ca + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),  v_e' = 2 (v_e . n) n - v_e
+//!   C = s_a ambient(n) Ca + fill (n . v_e) Cd + s_f sunlight ((n . v_l) Cd + (v_e' . v_l)^k Cs),
+//!   v_e' = 2 (v_e . n) n - v_e
 //!
-//! Ca, Cd and Cs are the ambient, diffuse and specular color, k is the exponent, s_f the sun visibility, n the normal,
-//! and v_l and v_e are unit vectors to the sun and to the eye.
+//! Ca, Cd and Cs are the ambient, diffuse and specular color, k is the exponent, s_a the ambient visibility, s_f the
+//! sun visibility, n the normal, and v_l and v_e are unit vectors to the sun and to the eye. Outdoors, the ambient
+//! light is the skylight for all n, and the fill light is 0.
 
 use nalgebra::Vector3;
 
@@ -17,10 +19,14 @@ pub(super) struct ShadedPoint {
     pub(super) point: Vector3<f64>,
     /// Geometric normal, flipped to the sun's side.
     pub(super) geometric_normal: Vector3<f64>,
+    /// Geometric normal, flipped to the eye's side; 0 for the sky.
+    pub(super) visible_normal: Vector3<f64>,
     /// Index of the triangle; `None` for ground and sky.
     pub(super) triangle: Option<usize>,
-    /// Linear radiance without the sun.
+    /// Linear radiance from the ambient light, without its occlusion.
     pub(super) ambient: Vector3<f64>,
+    /// Linear radiance that is never occluded: from the fill light, the sky and the haze.
+    pub(super) unoccluded: Vector3<f64>,
     /// Linear radiance from the unshadowed sun.
     pub(super) sun: Vector3<f64>,
     /// Cosine between normal and sun direction; 0 when the point faces away. On the ground, it is reduced by the haze.
@@ -34,8 +40,10 @@ pub(super) fn shade_sky(view: &ReferenceView, ray: &Ray) -> ShadedPoint {
     ShadedPoint {
         point,
         geometric_normal: zero,
+        visible_normal: zero,
         triangle: None,
-        ambient: view.sky_color(&ray.direction),
+        ambient: zero,
+        unoccluded: view.sky_color(&ray.direction),
         sun: zero,
         cosine: 0.0,
         alpha: 1.0,
@@ -51,8 +59,10 @@ pub(super) fn shade_ground(view: &ReferenceView, ray: &Ray, t: f64) -> ShadedPoi
     ShadedPoint {
         point,
         geometric_normal: view.up,
+        visible_normal: view.up,
         triangle: None,
-        ambient: haze.lerp(&color.component_mul(&view.skylight), visibility),
+        ambient: color.component_mul(&view.ambient_light(&view.up)) * visibility,
+        unoccluded: haze * (1.0 - visibility),
         sun: color.component_mul(&view.sunlight) * (visibility * cosine),
         cosine: visibility * cosine,
         alpha: 1.0,
@@ -67,10 +77,10 @@ pub(super) fn shade_triangle(ray_scene: &RayScene, view: &ReferenceView, ray: &R
         material.color_texture.as_ref().map_or([1.0; 4], |texture| texture.sample(ray_scene.uv(hit)));
     let texture_color = Vector3::new(r, g, b);
     let normal = shading_normal(ray_scene, hit);
+    let to_eye = normalize(view.eye - point);
     let cosine = normal.dot(&view.to_sun);
     let mut sun = Vector3::zeros();
     if cosine > 0.0 {
-        let to_eye = normalize(view.eye - point);
         let reflected = 2.0 * to_eye.dot(&normal) * normal - to_eye;
         let specular_cosine = reflected.dot(&view.to_sun);
         let highlight = if specular_cosine > 0.0 { specular_cosine.powf(material.exponent) } else { 0.0 };
@@ -81,8 +91,11 @@ pub(super) fn shade_triangle(ray_scene: &RayScene, view: &ReferenceView, ray: &R
     ShadedPoint {
         point,
         geometric_normal: if geometric_normal.dot(&view.to_sun) < 0.0 { -geometric_normal } else { geometric_normal },
+        visible_normal: if hit.is_front { geometric_normal } else { -geometric_normal },
         triangle: Some(hit.triangle),
-        ambient: view.skylight.component_mul(&material.ambient).component_mul(&texture_color),
+        ambient: view.ambient_light(&normal).component_mul(&material.ambient).component_mul(&texture_color),
+        unoccluded: view.fill.component_mul(&material.diffuse).component_mul(&texture_color)
+            * normal.dot(&to_eye).max(0.0),
         sun,
         cosine: cosine.max(0.0),
         alpha: if ray_scene.is_blended(hit) { material.alpha * texture_alpha } else { 1.0 },

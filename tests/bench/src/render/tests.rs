@@ -18,11 +18,13 @@ use super::{RenderProgress, RenderReportOptions, render};
 use modalcast_compute::reference::ReferenceDeformer;
 use modalcast_model::deform::{DeformedSurface, Deformer as _};
 use modalcast_model::domain::{AlphaMode, Material, Mesh, Texture};
-use modalcast_model::scene::{BoundingBox, Camera, Ground, Lens, Scene, SceneParts, SceneState, View};
+use modalcast_model::scene::{
+    BoundingBox, Camera, Ground, Lens, Lighting, RenderSettings, Scene, SceneParts, SceneState, StudioLight, View,
+};
 use modalcast_render::FrameParams;
 
 /// A scene without domains, ground and shadow, with a black sky. The sun shines along -z.
-fn empty_parts() -> SceneParts {
+pub(super) fn empty_parts() -> SceneParts {
     let mut parts = SceneParts::named("test");
     (parts.look.shadow, parts.look.ground) = (None, None);
     (parts.look.zenith, parts.look.horizon) = ([0.0; 3], [0.0; 3]);
@@ -34,7 +36,7 @@ fn upright_square([left, bottom, right, top]: [f32; 4], z: f32) -> Mesh {
     quad([[left, bottom, z], [right, bottom, z], [right, top, z], [left, top, z]], [0.0, 0.0, 1.0]).expect("a square")
 }
 
-fn deform_at_rest(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
+pub(super) fn deform_at_rest(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
     let mut deformer = ReferenceDeformer::new(scene);
     let bounds = deformer.deform(&SceneState::rest(scene)).expect("deformed vertices").bounds;
     (deformer.surface().expect("a surface").clone(), bounds)
@@ -42,7 +44,7 @@ fn deform_at_rest(scene: &Arc<Scene>) -> (DeformedSurface, BoundingBox) {
 
 /// Position of the camera, ten units from the origin, which is at the center of the frame.
 #[derive(Clone, Copy)]
-enum Viewpoint {
+pub(super) enum Viewpoint {
     /// On the z axis.
     Front,
     /// On the y axis.
@@ -50,7 +52,7 @@ enum Viewpoint {
 }
 
 /// Parameters of a square frame with ten pixels per unit in the plane z = 0, or y = 0 when seen from above.
-fn frame_params(bounds: BoundingBox, side: u32, viewpoint: Viewpoint) -> FrameParams {
+pub(super) fn frame_params(bounds: BoundingBox, side: u32, viewpoint: Viewpoint) -> FrameParams {
     let center = f64::from(side) / 2.0;
     let (eye, up) = match viewpoint {
         Viewpoint::Front => ([0.0, 0.0, 10.0], [0.0, 1.0, 0.0]),
@@ -165,7 +167,7 @@ fn sorts_transparent_layers_by_depth_in_any_domain_order() {
 /// at the lowest vertex, so a small square sets its height to 0.
 fn shadow_edge(caster: Material) -> SceneParts {
     let mut parts = empty_parts();
-    parts.look.ground = Some(Ground { color: [1.0; 3] });
+    parts.look.ground = Some(Ground { color: Some([1.0; 3]) });
     parts.look.sun = [3.0, 4.0, 0.0];
     // The sun comes from +x: a point at height 4 casts its shadow 3 units to the left.
     let positions = [[3.3, 4.0, 9.0], [9.0, 4.0, 9.0], [9.0, 4.0, -9.0], [3.3, 4.0, -9.0]];
@@ -266,7 +268,7 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
     let mut harness = RenderHarness::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
     // Only the drawn scene has this sun. The reference keeps the sun of the workload.
     let mut color_errors = |sun: [f32; 3]| {
-        let look = modalcast_model::scene::RenderSettings { sun, ..variant.settings(animation.scene.look) };
+        let look = RenderSettings { sun, ..variant.settings(animation.scene.look) };
         let lit_scene = light_meter::with_settings(&animation.scene, look).expect("valid settings");
         let mut loaded_scene = harness.load(&lit_scene).expect("a loaded scene");
         harness.deform(&mut loaded_scene, &SceneState::rest(&lit_scene)).expect("deformed vertices");
@@ -286,6 +288,54 @@ fn drawn_scene_matches_reference_unless_sun_moves() {
         with_moved_sun.mean > 1.5 * with_same_sun.mean && with_moved_sun.p99 > 40.0,
         "control: expected larger errors than {with_same_sun:?}, got {with_moved_sun:?}"
     );
+}
+
+#[test]
+fn drawn_bracket_matches_reference_only_with_its_occlusion() {
+    let animation = RenderWorkload::Bracket.build().expect("a workload");
+    let size = Size { width: 160, height: 90 };
+    let mut harness = RenderHarness::open().expect("EGL and OpenGL 4.3 (libegl1, libegl-mesa0, libgl1-mesa-dri)");
+    let mut variants = variants::all(true);
+    variants.retain(|variant| variant.is_applicable(RenderWorkload::Bracket));
+    let [with_occlusion, without_occlusion] = &variants[..] else { panic!("expected two, got {variants:?}") };
+    let mut surface_errors = |variant: &variants::RenderVariant| {
+        let scene = light_meter::with_settings(&animation.scene, variant.settings(animation.scene.look));
+        let scene = scene.expect("valid settings");
+        let mut loaded_scene = harness.load(&scene).expect("a loaded scene");
+        harness.deform(&mut loaded_scene, &SceneState::rest(&scene)).expect("deformed vertices");
+        let image = harness.draw(&loaded_scene, animation.camera(size), size).expect("a frame");
+        // The reference always has the ambient occlusion, by 16 x 4 rays per pixel.
+        let view = ReferenceView::new(&animation.scene, &loaded_scene.frame_params(animation.camera(size), size));
+        let ray_scene = RayScene::new(&animation.scene, loaded_scene.surface().expect("a surface"));
+        let counts = SampleCounts { ambient_rays: 4, ..SampleCounts::QUICK };
+        let reference = trace_reference_images(&ray_scene, &view, &[ShadowModel::Unshadowed], counts).remove(0);
+        harness.unload(loaded_scene);
+        metrics::compare_colors_where(&image.rgba, &reference.colors, &reference.shows_triangle)
+    };
+    let [with_occlusion, without_occlusion] = [with_occlusion, without_occlusion].map(&mut surface_errors);
+    // The bracket covers about a quarter of the image.
+    assert!((2000..6000).contains(&with_occlusion.count), "{with_occlusion:?}");
+    assert!(
+        without_occlusion.mean > 3.0 && with_occlusion.mean < 0.7 * without_occlusion.mean,
+        "expected smaller errors with occlusion, got {with_occlusion:?}, without {without_occlusion:?}"
+    );
+}
+
+/// Studio lighting without the sun on a plane that faces the camera: ambient light of the side +z, and fill light.
+#[test]
+fn studio_lights_a_plane_with_its_cube_and_fill() {
+    let mut parts = empty_parts();
+    parts.look = RenderSettings { sunlight: [0.0; 3], ground: None, shadow: None, ..Lighting::Studio.settings() };
+    let material = Material { ambient: [0.5, 0.25, 1.0], diffuse: [0.2, 0.4, 0.8], ..Material::default() };
+    add_rigid_domain(&mut parts, "square", upright_square([-3.0, -3.0, 3.0, 3.0], 0.0), material).expect("a domain");
+    let StudioLight { ambient_cube, fill } = parts.look.studio_light(parts.up).expect("a studio");
+    let image = trace_images(parts, Viewpoint::Front, &[ShadowModel::Unshadowed], 41).remove(0);
+    let color = linear_color(&image, 20 * 41 + 20);
+    for (channel, (ambient, diffuse)) in [(0.5, 0.2), (0.25, 0.4), (1.0, 0.8)].into_iter().enumerate() {
+        // Side 4 is +z. The plane faces the eye, and nothing is near it.
+        let expected = f64::from(ambient_cube[4][channel]) * ambient + f64::from(fill[channel]) * diffuse;
+        assert!((color[channel] - expected).abs() < 1e-4, "expected {expected}, got {}", color[channel]);
+    }
 }
 
 #[test]

@@ -51,6 +51,8 @@ pub struct RenderVariant {
     pub culling: Option<Culling>,
     /// Antialiasing, for variants that compare it.
     pub antialias: Option<Antialiasing>,
+    /// Whether the scene's ambient occlusion is drawn, for variants that compare it.
+    pub has_occlusion: Option<bool>,
     /// Implementation of the shadow blur. It changes the image only by rounding.
     pub blur_method: BlurMethod,
     pub intended_reference: ReferenceKind,
@@ -69,7 +71,8 @@ impl RenderVariant {
     pub fn settings(&self, look: RenderSettings) -> RenderSettings {
         let (transparency, culling) =
             (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
-        let settings = RenderSettings { shadow: self.shadow, transparency, culling, ..look };
+        let ambient_occlusion = look.ambient_occlusion.filter(|_| self.has_occlusion != Some(false));
+        let settings = RenderSettings { shadow: self.shadow, transparency, culling, ambient_occlusion, ..look };
         match self.antialias {
             Some(antialias) => RenderSettings { antialias, samples: MULTISAMPLES, ..settings },
             None => settings,
@@ -80,17 +83,23 @@ impl RenderVariant {
     pub fn is_applicable(&self, workload: RenderWorkload) -> bool {
         let is_large = matches!(workload, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
         let matches_packing = self.packing.is_some() == (workload == RenderWorkload::Images);
+        let matches_occlusion = self.has_occlusion.is_some() == (workload == RenderWorkload::Bracket);
         matches_packing
+            && matches_occlusion
             && (self.transparency.is_none() || workload == RenderWorkload::Panes)
             && (self.culling.is_none() || is_large)
             && (self.antialias.is_none() || is_large || workload == RenderWorkload::Square)
     }
 
     /// Whether the variant is expected to exceed its limits on a workload: moments alone let light bleed where layers
-    /// of occluders overlap.
+    /// of occluders overlap, and the recesses of the bracket are too bright without ambient occlusion.
     pub fn is_expected_to_fail(&self, workload: RenderWorkload) -> bool {
         let has_moments_only = |shadow: ShadowSettings| shadow.has_moments() && !shadow.pcf_fallback;
-        workload == RenderWorkload::Layers && self.shadow.is_some_and(has_moments_only)
+        match workload {
+            RenderWorkload::Layers => self.shadow.is_some_and(has_moments_only),
+            RenderWorkload::Bracket => self.has_occlusion == Some(false),
+            _ => false,
+        }
     }
 
     fn without_shadow() -> Self {
@@ -102,6 +111,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
+            has_occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Unshadowed,
         }
@@ -118,6 +128,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
+            has_occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -179,6 +190,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
+            has_occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -192,6 +204,11 @@ impl RenderVariant {
     /// Images with this packing, without shadows.
     fn with_packing(name: &str, packing: Packing) -> Self {
         Self { name: name.into(), packing: Some(packing), ..Self::without_shadow() }
+    }
+
+    /// With or without the scene's ambient occlusion, without shadows.
+    fn with_occlusion((name, has_occlusion): (&str, bool)) -> Self {
+        Self { name: name.into(), has_occlusion: Some(has_occlusion), ..Self::without_shadow() }
     }
 
     /// One antialiasing method, without shadows. The reference has 64 samples per pixel, 16 in a quick run.
@@ -219,6 +236,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
+            has_occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference,
         }
@@ -254,6 +272,7 @@ pub fn all(quick: bool) -> Vec<RenderVariant> {
         [("none", Antialiasing::None), ("4 samples", Antialiasing::Msaa), ("fxaa", Antialiasing::Fxaa)]
             .map(RenderVariant::with_antialias),
     );
+    variants.extend(occlusion_variants());
     variants
 }
 
@@ -263,6 +282,10 @@ fn packing_variants() -> [RenderVariant; 3] {
         RenderVariant::with_packing("images repeat-filled", Packing::PrintedRepetition),
         RenderVariant::with_packing("images repeat-filled, whole", Packing::CorrectedRepetition),
     ]
+}
+
+fn occlusion_variants() -> [RenderVariant; 2] {
+    [("occlusion", true), ("no occlusion", false)].map(RenderVariant::with_occlusion)
 }
 
 fn culling_variants() -> [RenderVariant; 3] {
@@ -291,12 +314,14 @@ fn quick_variants() -> Vec<RenderVariant> {
     ];
     variants.extend(packing_variants());
     variants.extend(culling_variants());
+    variants.extend(occlusion_variants());
     variants
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use modalcast_model::scene::Lighting;
 
     #[test]
     fn names_are_unique_and_variants_change_only_their_feature() {
@@ -304,10 +329,10 @@ mod tests {
             let variants = all(quick);
             let names: std::collections::BTreeSet<&str> =
                 variants.iter().map(|variant| variant.name.as_str()).collect();
-            // Quick: 16 variants, 3 of packing and 3 of culling. All: 1 without shadow, 5 map sizes x 6, 2 f16, 1
-            // without the fallback, 2 bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2 transparency, 3 of
-            // packing, 3 of culling and 3 of antialiasing.
-            assert_eq!((names.len(), variants.len()), if quick { (22, 22) } else { (60, 60) });
+            // Quick: 16 variants, 3 of packing, 3 of culling and 2 of occlusion. All: 1 without shadow, 5 map sizes x
+            // 6, 2 f16, 1 without the fallback, 2 bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2
+            // transparency, 3 of packing, 3 of culling, 3 of antialiasing and 2 of occlusion.
+            assert_eq!((names.len(), variants.len()), if quick { (24, 24) } else { (62, 62) });
             for variant in &variants {
                 let settings = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
@@ -320,9 +345,10 @@ mod tests {
                 let applies_to = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
                     .map(|workload| variant.is_applicable(workload));
                 let needs_large_scene = variant.culling.is_some() || variant.antialias.is_some();
+                let has_plain_shading = !has_packing && variant.has_occlusion.is_none();
                 assert_eq!(
                     applies_to,
-                    [!has_packing && !needs_large_scene, !has_packing && !has_transparency, has_packing],
+                    [has_plain_shading && !needs_large_scene, has_plain_shading && !has_transparency, has_packing],
                     "panes, tree and images with {}",
                     variant.name
                 );
@@ -332,14 +358,31 @@ mod tests {
     }
 
     #[test]
-    fn only_moments_alone_on_the_layers_are_expected_to_fail() {
+    fn bracket_has_the_studio_with_and_without_its_occlusion() {
+        let look = Lighting::Studio.settings();
+        for quick in [false, true] {
+            let mut variants = all(quick);
+            variants.retain(|variant| variant.is_applicable(RenderWorkload::Bracket));
+            let [with_occlusion, without_occlusion] = &variants[..] else { panic!("expected two, got {variants:?}") };
+            let expected = RenderSettings { shadow: None, ..look };
+            assert_eq!(with_occlusion.settings(look), expected);
+            assert_eq!(without_occlusion.settings(look), RenderSettings { ambient_occlusion: None, ..expected });
+            assert!(expected.ambient_occlusion.is_some(), "control: the studio has ambient occlusion");
+        }
+    }
+
+    #[test]
+    fn only_moments_alone_and_no_occlusion_are_expected_to_fail() {
         for variant in all(false) {
             let workloads: Vec<RenderWorkload> = RenderWorkload::all(false)
                 .into_iter()
                 .filter(|workload| variant.is_expected_to_fail(*workload))
                 .collect();
-            let is_alone = variant.name.contains("moments only");
-            let expected: &[RenderWorkload] = if is_alone { &[RenderWorkload::Layers] } else { &[] };
+            let expected: &[RenderWorkload] = match variant.name.as_str() {
+                "no occlusion" => &[RenderWorkload::Bracket],
+                name if name.contains("moments only") => &[RenderWorkload::Layers],
+                _ => &[],
+            };
             assert_eq!(workloads, expected, "{}", variant.name);
         }
     }

@@ -8,6 +8,7 @@
 //! | `layers` | three sheets above each other whose edges cross, and a floor below them that is mostly in full shadow |
 //! | `panes` | three translucent panes in front of an opaque wall, listed from nearest to farthest |
 //! | `images` | panels with images of many sizes, each repeated |
+//! | `bracket` | a bracket with ribs and a boss, with studio lighting and ambient occlusion |
 //! | `tree` | the built-in tree |
 //! | `grove` | four built-in trees |
 //! | `triangles-N` | a rolling field of about N triangles with poles on it |
@@ -17,6 +18,7 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix4, Rotation3, Vector3};
 
+use super::bracket;
 use super::harness::Size;
 use super::light_meter::with_settings;
 use super::rigid_domain::add_rigid_domain;
@@ -36,6 +38,7 @@ pub enum RenderWorkload {
     Layers,
     Panes,
     Images,
+    Bracket,
     Tree,
     Grove,
     /// Approximate number of triangles.
@@ -69,7 +72,17 @@ impl RenderWorkload {
     /// Every workload, in the order of the report.
     pub fn all(quick: bool) -> Vec<Self> {
         let field = Self::Triangles(if quick { QUICK_FIELD_TRIANGLES } else { FULL_FIELD_TRIANGLES });
-        vec![Self::Square, Self::Shelf, Self::Layers, Self::Panes, Self::Images, Self::Tree, Self::Grove, field]
+        vec![
+            Self::Square,
+            Self::Shelf,
+            Self::Layers,
+            Self::Panes,
+            Self::Images,
+            Self::Bracket,
+            Self::Tree,
+            Self::Grove,
+            field,
+        ]
     }
 
     /// The workload with this name.
@@ -83,6 +96,7 @@ impl RenderWorkload {
             "layers" => Some(Self::Layers),
             "panes" => Some(Self::Panes),
             "images" => Some(Self::Images),
+            "bracket" => Some(Self::Bracket),
             "tree" => Some(Self::Tree),
             "grove" => Some(Self::Grove),
             _ => {
@@ -90,8 +104,9 @@ impl RenderWorkload {
                 triangle_count.filter(|count| (2..=MAX_TRIANGLES).contains(count)).map(Self::Triangles)
             }
         };
-        let expected =
-            format!("square, shelf, layers, panes, images, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})");
+        let expected = format!(
+            "square, shelf, layers, panes, images, bracket, tree, grove, or triangles-N (2 to {MAX_TRIANGLES})"
+        );
         workload.ok_or_else(|| invalid("load", expected, name))
     }
 
@@ -103,6 +118,7 @@ impl RenderWorkload {
             Self::Layers => "layers".into(),
             Self::Panes => "panes".into(),
             Self::Images => "images".into(),
+            Self::Bracket => "bracket".into(),
             Self::Tree => "tree".into(),
             Self::Grove => "grove".into(),
             Self::Triangles(count) => format!("triangles-{count}"),
@@ -114,13 +130,14 @@ impl RenderWorkload {
     /// # Errors
     /// Errors of [`Scene::new`] and of generating the tree.
     pub(super) fn build(self) -> Result<AnimatedScene> {
-        // Sliding domains: the square, the red pane, the first panel, the poles of the field.
+        // Sliding domains: the square, the red pane, the first panel, the bracket, the poles of the field.
         let (scene, sliding_domain) = match self {
             Self::Square => (Scene::new(build_square()?)?, Some(1)),
             Self::Shelf => (Scene::new(build_shelf()?)?, None),
             Self::Layers => (Scene::new(build_layers()?)?, None),
             Self::Panes => (Scene::new(build_panes()?)?, Some(1)),
             Self::Images => (Scene::new(texture_panels::build_panels()?)?, Some(0)),
+            Self::Bracket => (Scene::new(bracket::build_bracket()?)?, Some(0)),
             Self::Tree => (open_tree()?, None),
             Self::Grove => (Scene::new(build_grove(open_tree()?.as_ref()))?, None),
             Self::Triangles(count) => (Scene::new(build_field(count)?)?, Some(1)),
