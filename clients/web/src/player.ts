@@ -28,7 +28,7 @@ export class RecordingPlayer {
         return true;
     }
 
-    /** @param slow Factor of the slow motion that is played first; null: so that the lowest frequency is seen. */
+    /** @param slow Initial slow motion factor; null: by the lowest frequency of the scene. */
     private open(name: string, file: Uint8Array | (() => Uint8Array), slow: number | null = null): void {
         const { app } = this;
         this.close();
@@ -60,7 +60,7 @@ export class RecordingPlayer {
         this.playback = playback;
         this.timeline = new Timeline(playback);
         app.setPlayback(playback);
-        // After the time line, which covers a part of the image.
+        // After the time line was added, because it covers a part of the image.
         if (view) app.viewport.camera.frameAs(view);
         else app.viewport.camera.frame();
         playback.seek(0);

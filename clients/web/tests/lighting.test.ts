@@ -1,8 +1,69 @@
-/** Light and displayed colors. */
+/** Light of a scene, and displayed colors. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { lightOf } from "../src/render/lighting";
+import { create } from "@bufbuild/protobuf";
+import { LightingSchema } from "../src/proto/modalcast/v1/scenes_pb";
+import { texelsFromPixels } from "../src/render/ambient_occlusion";
+import { lightingOf, lightOf } from "../src/render/lighting";
+import type { SceneDescription } from "../src/scene/description";
+import { fourDomains } from "./scene";
+
+function sceneWith(lighting: Parameters<typeof create<typeof LightingSchema>>[1], up = "y"): SceneDescription {
+    const scene = fourDomains();
+    scene.info.up = up;
+    scene.info.lighting = create(LightingSchema, lighting);
+    return scene;
+}
+
+const CUBE = Array.from({ length: 18 }, (_, index) => index / 18);
+
+test("the sides of the ambient cube and the fill light are those of the message", () => {
+    const { studio, ambientOcclusionRadius } = lightingOf(
+        sceneWith({ ambientCube: CUBE, fill: [0.1, 0.2, 0.3], ambientOcclusionRadius: 0.15 }),
+    );
+    assert.deepEqual(studio?.ambientCube[0], CUBE.slice(0, 3));
+    assert.deepEqual(studio?.ambientCube[5], CUBE.slice(15));
+    assert.deepEqual(studio?.fill, [0.1, 0.2, 0.3]);
+    assert.equal(ambientOcclusionRadius, 0.15);
+});
+
+test("a missing cube is the skylight, and a missing fill light is dark", () => {
+    const skylight = [0.25, 0.5, 0.75];
+    const withFill = lightingOf(sceneWith({ skylight, fill: [1, 1, 1] }));
+    assert.deepEqual(withFill.studio?.ambientCube, Array(6).fill(skylight));
+    assert.deepEqual(lightingOf(sceneWith({ ambientCube: CUBE })).studio?.fill, [0, 0, 0]);
+    const outdoor = lightingOf(sceneWith({ skylight }));
+    assert.equal(outdoor.studio, null);
+    assert.equal(outdoor.ambientOcclusionRadius, 0);
+});
+
+test("a scene with an ambient cube is viewed from higher up", () => {
+    assert.deepEqual(lightingOf(sceneWith({ ambientCube: CUBE })).toCamera, [0.58, 0.46, 0.82]);
+    assert.deepEqual(lightingOf(sceneWith({ ambientCube: CUBE }, "z")).toCamera, [0.58, -0.82, 0.46]);
+    assert.deepEqual(lightingOf(sceneWith({})).toCamera, [0.42, 0.14, 0.9]);
+    // Servers of older versions send no lighting.
+    assert.deepEqual(lightingOf(fourDomains()).toCamera, [0.42, 0.14, 0.9]);
+});
+
+test("texels of images of odd size are at the centers of pixels", () => {
+    for (const pixels of [
+        { x: 640, y: 480 },
+        { x: 641, y: 7 },
+    ]) {
+        const texels = { width: Math.ceil(pixels.x / 2), height: Math.ceil(pixels.y / 2) };
+        const { elements } = texelsFromPixels(pixels, texels);
+        for (const texel of [0, 1, texels.width - 1]) {
+            // The center of pixel 2 * texel in normalized device coordinates of the canvas.
+            const ndc = (2 * (2 * texel + 0.5)) / pixels.x - 1;
+            const mapped = (elements[0] ?? 0) * ndc + (elements[12] ?? 0);
+            assert.ok(Math.abs(((mapped + 1) / 2) * texels.width - (texel + 0.5)) < 1e-9, `${pixels.x}: ${mapped}`);
+        }
+        const ndc = (2 * (2 * 3 + 0.5)) / pixels.y - 1;
+        const mapped = (elements[5] ?? 0) * ndc + (elements[13] ?? 0);
+        assert.ok(Math.abs(((mapped + 1) / 2) * texels.height - 3.5) < 1e-9, `${pixels.y}: ${mapped}`);
+    }
+});
 
 /** The tone curve of the shaders. */
 function displayed(light: number, exposure: number, tone: number): number {

@@ -77,7 +77,7 @@ export class Driver {
         return this.animation !== null;
     }
 
-    /** Seconds of the animated vibration per second of real time; null without one, or if its frequency is unknown. */
+    /** Simulated per real seconds of the animation; null without an animation, or if the frequency is unknown. */
     get timeScale(): number | null {
         if (!this.animation) return null;
         const { domain, mode, frequency } = this.animation;

@@ -1,6 +1,7 @@
 /**
- * How a body answers a force on a point: its static response from its modes and eigenvalues. With U^T M U = I, the modal
- * stiffnesses are the eigenvalues, so a force f on a point with the rows A U_i of U gives q_k = (A U_i)_k . f / eigenvalue_k.
+ * Static response of a body to a force on a point, from its modes and eigenvalues. With U^T M U = I, the modal
+ * stiffnesses are the eigenvalues, so a force f on a point with the rows U_i of U gives
+ * q_k = (A U_i)_k . f / eigenvalue_k, with the linear part A of T.
  */
 
 import { applyLinear, norm, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
@@ -10,7 +11,7 @@ import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import type { SurfacePoint } from "./surface_point";
 
-/** Two directions with a larger cosine have one limit. The angle between them is 1 degree. */
+/** Cosine of 1 degree. The limit is computed again only if the direction changes by more. */
 const SAME_DIRECTION = Math.cos(Math.PI / 180);
 
 export class PointCompliance {
@@ -19,10 +20,10 @@ export class PointCompliance {
 
     /**
      * @param responses q per newton in the direction of each world axis.
-     * @param stiffness Newtons per scene unit. The inverse of the sum of the compliances along the three axes, which is at
-     *   least the compliance in any direction, so that the point does not pass the cursor.
-     * @param largestDeflection Of the body in meters at coordinates q.
-     * @param allowed Meters.
+     * @param stiffness Newtons per scene unit: the inverse of the sum of the compliances along the three axes. The sum
+     *   is at least the compliance in any direction, so the point does not pass the cursor.
+     * @param largestDeflection Largest deflection of the body in meters at coordinates q.
+     * @param allowed Largest allowed deflection in meters.
      */
     constructor(
         private readonly responses: readonly Float64Array[],
@@ -32,8 +33,8 @@ export class PointCompliance {
     ) {}
 
     /**
-     * The force in newtons that deflects the body by the allowed deflection, if it acts in a direction for so long that
-     * the body comes to rest. Infinite if nothing bends.
+     * The force in newtons whose static deflection of the body is the allowed one, for a direction. Infinite if nothing
+     * bends.
      */
     limit(direction: Vec3): number {
         const length = norm(direction);
@@ -52,9 +53,9 @@ export class PointCompliance {
 }
 
 /**
- * The compliance at a point; null if no mode has an eigenvalue above 0. The allowed deflection is a fraction of the size
- * of the body. Without `deflections`, the deflection of the pulled point stands for that of the body, and the diagonal of
- * the scene in scene units for its size.
+ * The compliance at a point; null if no mode has stiffness. The allowed deflection is a fraction of the size of the
+ * body. Without `deflections`, the deflection of the pulled point is used instead of the body's, and the diagonal of
+ * the scene (in scene units) instead of the body's size.
  */
 export function pointCompliance(
     model: SceneModel,

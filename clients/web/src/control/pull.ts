@@ -21,8 +21,8 @@ import { deflectionAt, displacementAt, jointPoint, positionOf, type SurfacePoint
 const RENEWAL_MS = 100;
 const LIFETIME_MS = 500;
 /**
- * Without eigenvalues, the viewer knows no compliance. Force in newtons at a distance of the scene's diagonal, and
- * distance at which the force stops growing, in diagonals of the scene.
+ * Without eigenvalues, the compliance is unknown. These constants replace it: the force in newtons at a distance of the
+ * scene's diagonal, and the distance at which the force stops growing, in diagonals of the scene.
  */
 const DEFAULT_FORCE = 1000;
 const LONGEST_PULL = 0.1;
@@ -31,9 +31,9 @@ export interface PullView {
     from: Vec3;
     to: Vec3;
     newtons: number;
-    /** Newtons of the largest force in this direction; null if it is unknown. */
+    /** Largest force in this direction in newtons; null if it is unknown. */
     limit: number | null;
-    /** Whether the cursor asks for a larger force. */
+    /** Whether the force is at its limit. */
     isLimited: boolean;
     /** Deflection of the point in meters. */
     deflection: number;
@@ -43,7 +43,7 @@ export class PullTool {
     private point: SurfacePoint | null = null;
     private anchor: Vec3 = [0, 0, 0];
     private cursor: [number, number] = [0, 0];
-    /** Null without a pull, and if it is unknown. */
+    /** Null without a pull, or if the compliance is unknown. */
     private compliance: PointCompliance | null = null;
     private isPressed = false;
     /** Number of presses, so that the pick of an earlier one is ignored. */

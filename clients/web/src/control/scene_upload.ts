@@ -5,7 +5,7 @@ import type { Limits } from "../proto/modalcast/v1/server_pb";
 import type { Server, UploadedFile } from "../source/server";
 import * as format from "../ui/format";
 
-/** Extensions of models, for the name of a scene of several files. The server decides which file it opens. */
+/** Model files, which give a scene of several files its name. The server decides which file it opens. */
 const MODEL = /\.(glb|gltf|obj|ply|stl|npz)$/i;
 const MAX_NAME_LETTERS = 64;
 /** Largest number of files of an upload, see UploadHeader. */
@@ -22,7 +22,7 @@ export function uploadProblem(files: readonly UploadedFile[], limits: Pick<Limit
         return `The server accepts at most ${limit} for a scene, and these files have ${format.bytes(total)}.`;
     }
     if (!globalThis.crypto?.subtle)
-        return "The browser cannot compute the checksums of an upload on this page, because it was loaded from another machine without encryption. Open it through `ssh -L`, so that its address begins with localhost.";
+        return "The browser cannot compute the checksums of an upload on this page, because it was loaded from another machine without encryption. Open it over HTTPS, or through `ssh -L`, so that its address begins with localhost.";
     return "";
 }
 
@@ -32,22 +32,26 @@ export function entryOf(files: readonly UploadedFile[]): string {
 }
 
 /**
- * The files with a scene.toml that sets the unit of their model to millimeters; null if they have one, or not one model.
+ * The files and a scene.toml that sets the unit of their model to millimeters. Null if the files contain a scene.toml,
+ * or not exactly one model.
  */
 export function inMillimeters(files: readonly UploadedFile[]): UploadedFile[] | null {
     const [model, ...others] = files.filter(({ path }) => MODEL.test(path));
     if (!model || others.length > 0 || files.some(({ path }) => /(^|\/)scene\.toml$/.test(path))) return null;
-    // A JSON string is a string of TOML.
+    // A JSON string is also a TOML string.
     const text = `model = ${JSON.stringify(model.path)}\nunit = "mm"\n`;
     return [...files, { path: "scene.toml", file: new Blob([text]) }];
 }
 
-/** Whether the server presumes that the model is in millimeters, because its file has no unit and is very large in meters. */
+/**
+ * Whether a remark of the server says that the model may be in millimeters: it has no unit, and is very large in
+ * meters.
+ */
 export function mayBeInMillimeters({ remarks }: Pick<SceneInfo, "remarks">): boolean {
     return remarks.some((remark) => remark.includes("if its file is in millimeters"));
 }
 
-/** A name for a scene of the files that no other scene has. */
+/** A scene name for the files that no other scene has. */
 export function sceneName(files: readonly UploadedFile[], used: ReadonlySet<string>): string {
     const { path } = files.find((candidate) => MODEL.test(candidate.path)) ?? files[0] ?? { path: "" };
     const stem = path.replace(/^.*\//, "").replace(/\.[^.]*$/, "");
@@ -62,7 +66,7 @@ export function sceneName(files: readonly UploadedFile[], used: ReadonlySet<stri
 /**
  * Uploads the files, and opens them as a scene.
  *
- * @param progress Called with the sum of the bytes that were sent, and the bytes of all files.
+ * @param progress Called with the number of bytes sent so far, and the number of bytes of all files.
  * @throws Error with a sentence for the user.
  */
 export async function uploadScene(

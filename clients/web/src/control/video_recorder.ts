@@ -5,7 +5,7 @@ export interface VideoType {
     extension: string;
 }
 
-/** MP4 with H.264 first, because every video player and office program shows it. */
+/** MP4 with H.264 first, because video players and office programs support it most widely. */
 const TYPES: readonly VideoType[] = [
     { mimeType: "video/mp4;codecs=avc1.640033", extension: "mp4" },
     { mimeType: "video/mp4", extension: "mp4" },
@@ -17,7 +17,7 @@ const TYPES: readonly VideoType[] = [
 const BITS_PER_PIXEL = 0.15;
 const FRAMES_PER_SECOND = 30;
 const MAX_BITS_PER_SECOND = 25e6;
-/** Milliseconds between the pieces of a video, so that a long one is not held by the encoder. */
+/** Milliseconds of video per chunk, so that the encoder does not buffer a long video. */
 const PIECE_MS = 1000;
 
 /** The first type that the browser can record; null if there is none. */

@@ -7,7 +7,7 @@ import type { CameraSchema } from "../proto/modalcast/v1/frames_pb";
 import { addScaled, dot, norm, subtract, type Vec3 } from "../scene/affine";
 import type { SceneDescription } from "../scene/description";
 import { FIELD_OF_VIEW, fitBox, fitPicture, type ImageArea, type PictureCamera } from "./framing";
-import { fromYUp, normalized, unitVector, upAxis } from "./lighting";
+import { fromYUp, lightingOf, normalized, unitVector, upAxis } from "./lighting";
 
 /** Tangent of the angle between the up axis and the direction of a view from above or below. */
 const TOP_VIEW_TILT = 1e-4;
@@ -23,7 +23,7 @@ export class OrbitCamera {
     private framedFrom: Vec3 | null = null;
     /** Whether the camera has moved since it framed the scene. */
     hasMoved = false;
-    /** How many pixels of the element other elements cover at its top and bottom. */
+    /** Heights in pixels that other elements cover at the top and bottom of the element. */
     coveredHeights: () => Pick<ImageArea, "coveredTop" | "coveredBottom"> = () => ({ coveredTop: 0, coveredBottom: 0 });
     onChange: () => void = () => {};
 
@@ -53,7 +53,7 @@ export class OrbitCamera {
         return (2 * slope * norm(subtract(this.eye, this.target))) / Math.max(1, clientHeight);
     }
 
-    /** A direction of the world in the image: to the right, up, and towards the viewer. */
+    /** A world direction in view axes: right, up, and towards the viewer. */
     directionInView(direction: Vec3): Vec3 {
         this.camera.updateMatrixWorld();
         return new THREE.Vector3(...direction).transformDirection(this.camera.matrixWorldInverse).toArray() as Vec3;
@@ -72,11 +72,10 @@ export class OrbitCamera {
     }
 
     /**
-     * Views the rest bounds: from a direction, or from that of the recorded view. Without both, from the front, slightly
-     * from above and from the side, as the server's default camera. The view follows the size of the element until the
-     * camera moves.
+     * Views the rest bounds. Without a direction, it uses the direction of the recorded view or, without one, that of
+     * the server's default camera. The view adapts to the size of the element until the camera moves.
      *
-     * @param toCamera Unit vector.
+     * @param toCamera Unit vector from the scene to the camera.
      */
     frame(toCamera: Vec3 | null = null): void {
         if (!this.scene) return;
@@ -84,7 +83,7 @@ export class OrbitCamera {
         const { bounds } = this.scene.info;
         const { recordedView } = this;
         this.framedFrom = toCamera;
-        const direction = toCamera ?? normalized(fromYUp([0.42, 0.14, 0.9], axis));
+        const direction = toCamera ?? normalized(lightingOf(this.scene).toCamera);
         const { eye, target } =
             recordedView && !toCamera
                 ? fitPicture(recordedView, bounds, unitVector(axis), this.imageArea)
@@ -93,21 +92,21 @@ export class OrbitCamera {
         this.hasMoved = false;
     }
 
-    /** Frames the scene as a recorded picture does. */
+    /** Frames the scene as the recorded view does. */
     frameAs(view: PictureCamera): void {
         this.recordedView = view;
         this.frame();
     }
 
     /**
-     * Views the scene along an axis of the world. A camera that has not moved since it framed the scene frames it again;
-     * another one keeps its target and distance.
+     * Views the scene along an axis of the world. If the camera has not moved since it framed the scene, it frames the
+     * scene again. Otherwise, it keeps its target and distance.
      */
     lookAlong(toCamera: Vec3): void {
         if (!this.scene) return;
         const axis = upAxis(this.scene);
         const isUp = toCamera[axis] !== 0;
-        // A camera above or below its target needs an up direction in the image: y or, if y is up, -z.
+        // The up direction of a view from above or below is y or, if y is up, -z.
         const tilt = fromYUp([0, 0, isUp ? TOP_VIEW_TILT : 0], axis);
         const direction = normalized(addScaled(toCamera, tilt, 1));
         if (!this.hasMoved) return this.frame(direction);

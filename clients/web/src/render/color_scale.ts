@@ -1,4 +1,4 @@
-/** The value at the bright end of the color map. It fits the shown values: see FittedRange. */
+/** The value at the bright end of the color map, which fits the shown values (see FittedRange). */
 
 import type { Deflections } from "../scene/deflection";
 import { FittedRange } from "../scene/fitted_range";
@@ -14,8 +14,8 @@ export class ColorScale {
     private lastUpdate = -Infinity;
 
     /**
-     * @param deflections Null if the viewer has no U: then the end is unknown.
-     * @param size Of the scene in meters.
+     * @param deflections Null if the viewer has no U. The end is then unknown.
+     * @param size Size of the scene in meters.
      */
     constructor(
         private readonly deflections: Deflections | null,

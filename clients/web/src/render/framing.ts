@@ -1,16 +1,16 @@
-/** The view in which a box fits into the part of the image that other elements of the page leave free. */
+/** Fits a box into the free area of the image, which other elements of the page do not cover. */
 
 import { addScaled, cross, dot, norm, subtract, type Vec3 } from "../scene/affine";
 import { at } from "../scene/numbers";
 import { normalized } from "./lighting";
 
-/** Vertical field of view in degrees, and fraction of the free area that a framed box fills. The server uses the same. */
+/** Vertical field of view in degrees, and fraction of the free area that a framed box fills, as on the server. */
 export const FIELD_OF_VIEW = 28;
 const IMAGE_FILL = 0.94;
-/** Smallest fraction of the height that counts as free, however much is covered. */
+/** Fraction of the height that is treated as free even if more is covered. */
 const SMALLEST_FREE_HEIGHT = 0.3;
 
-/** An image, and how much of it is covered at its top and bottom, in pixels. */
+/** Size of an image, and the heights that are covered at its top and bottom, in pixels. */
 export interface ImageArea {
     width: number;
     height: number;
@@ -24,7 +24,7 @@ export interface View {
     target: Vec3;
 }
 
-/** The view of a picture with its vertical field of view in degrees, and width divided by height. */
+/** The camera of a picture, with its vertical field of view in degrees and its aspect ratio (width by height). */
 export interface PictureCamera extends View {
     fieldOfView: number;
     aspect: number;
@@ -38,7 +38,7 @@ interface ImageAxis {
 }
 
 /**
- * The closest view from a direction in which a box is within the free area of the image. The center of the box is at the
+ * The closest view from a direction with the whole box in the free area of the image. The center of the box is at the
  * center of the free area, so camera and target are moved parallel to the image.
  *
  * @param bounds min x, y, z, max x, y, z.
@@ -85,8 +85,8 @@ function imageAxes(
 }
 
 /**
- * The view of a picture for an image of another aspect: from the same direction, it shows the box if the picture shows the
- * whole box, and otherwise at least what the picture shows around its target.
+ * The view of a picture, adapted to another aspect ratio. The direction is the same. If the picture shows the whole
+ * box, the view fits the box. Otherwise, it shows at least what the picture shows around its target.
  */
 export function fitPicture(picture: PictureCamera, bounds: ArrayLike<number>, up: Vec3, area: ImageArea): View {
     const { eye, target, fieldOfView, aspect } = picture;

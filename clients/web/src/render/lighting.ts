@@ -1,6 +1,6 @@
 /** Light, sky and ground of a scene. Colors are linear RGB, and vectors are in world axes. */
 
-import { ToneMapping } from "../proto/modalcast/v1/scenes_pb";
+import { type Lighting as LightingMessage, ToneMapping } from "../proto/modalcast/v1/scenes_pb";
 import { cross, dot, norm, type Vec3 } from "../scene/affine";
 import type { SceneDescription } from "../scene/description";
 
@@ -11,11 +11,28 @@ export interface Lighting {
     zenith: Vec3;
     horizon: Vec3;
     ground: Vec3 | null;
+    /** Null if the ambient light is `skylight` for every normal, and there is no fill light. */
+    studio: StudioLight | null;
+    /** Radius as a fraction of the diagonal of the scene at rest; 0 without ambient occlusion. */
+    ambientOcclusionRadius: number;
     shadows: boolean;
     exposure: number;
     /** 0: none, 1: Reinhard, 2: ACES. */
     tone: number;
+    /** Direction from the scene to the default camera, not normalized. */
+    toCamera: Vec3;
 }
+
+export interface StudioLight {
+    /** Colors of the sides +x, -x, +y, -y, +z and -z. */
+    ambientCube: readonly Vec3[];
+    /** Fill light at the camera, which is diffuse and casts no shadow. */
+    fill: Vec3;
+}
+
+/** Directions from the scene to the server's default camera, in Y-up coordinates. */
+const OUTDOOR_CAMERA: Vec3 = [0.42, 0.14, 0.9];
+const STUDIO_CAMERA: Vec3 = [0.58, 0.46, 0.82];
 
 export type UpAxis = 0 | 1 | 2;
 
@@ -48,34 +65,52 @@ function defaultLighting(axis: UpAxis): Lighting {
         zenith: [0.1, 0.27, 0.58],
         horizon: [0.34, 0.54, 0.79],
         ground: [0.4, 0.41, 0.36],
+        studio: null,
+        ambientOcclusionRadius: 0,
         shadows: true,
         exposure: 1,
         tone: 0,
+        toCamera: fromYUp(OUTDOOR_CAMERA, axis),
     };
 }
 
 export function lightingOf(scene: SceneDescription): Lighting {
     const { lighting } = scene.info;
-    const defaults = defaultLighting(upAxis(scene));
+    const axis = upAxis(scene);
+    const defaults = defaultLighting(axis);
     if (!lighting) return defaults;
     const vector = (value: number[], fallback: Vec3) => (value.length === 3 ? (value as Vec3) : fallback);
+    const skylight = vector(lighting.skylight, defaults.skylight);
     return {
         toSun: normalized(vector(lighting.toSun, defaults.toSun)),
         sunlight: vector(lighting.sunlight, defaults.sunlight),
-        skylight: vector(lighting.skylight, defaults.skylight),
+        skylight,
         zenith: vector(lighting.zenith, defaults.zenith),
         horizon: vector(lighting.horizon, defaults.horizon),
         ground: lighting.ground.length === 3 ? (lighting.ground as Vec3) : null,
+        studio: studioOf(lighting, skylight),
+        ambientOcclusionRadius: lighting.ambientOcclusionRadius ?? 0,
         shadows: lighting.shadows,
         exposure: lighting.exposure,
         tone: lighting.toneMapping === ToneMapping.REINHARD ? 1 : lighting.toneMapping === ToneMapping.ACES ? 2 : 0,
+        // The description does not name the lighting. Only studio lighting has an ambient cube.
+        toCamera: fromYUp(lighting.ambientCube.length > 0 ? STUDIO_CAMERA : OUTDOOR_CAMERA, axis),
     };
 }
 
-/** Largest light of the tone curve. */
+function studioOf({ ambientCube, fill }: LightingMessage, skylight: Vec3): StudioLight | null {
+    if (ambientCube.length !== 18 && fill.length !== 3) return null;
+    const side = (first: number) => ambientCube.slice(first, first + 3) as Vec3;
+    return {
+        ambientCube: [0, 3, 6, 9, 12, 15].map((first) => (ambientCube.length === 18 ? side(first) : skylight)),
+        fill: fill.length === 3 ? (fill as Vec3) : [0, 0, 0],
+    };
+}
+
+/** Largest value of f16, because the inverse of a tone curve may be infinite. */
 const LARGEST_LIGHT = 65504;
 
-/** The light that is displayed as a linear value from 0 to 1: the inverse of the tone curve. */
+/** The light that the tone curve maps to a displayed linear value from 0 to 1. */
 export function lightOf(displayed: number, { exposure, tone }: Pick<Lighting, "exposure" | "tone">): number {
     return Math.min(inverseTone(displayed, tone) / exposure, LARGEST_LIGHT);
 }

@@ -1,4 +1,4 @@
-/** Draws one scene with three.js: deformation, shadow map, surfaces, sky and ground. */
+/** Draws one scene with three.js: deformation, shadow map, ambient occlusion, surfaces, sky and ground. */
 
 import * as THREE from "three";
 import { norm, subtract, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
@@ -8,6 +8,7 @@ import type { SceneDescription } from "../scene/description";
 import { at } from "../scene/numbers";
 import { errorBound } from "../scene/packed_modes";
 import type { SceneState } from "../scene/state";
+import { AmbientOcclusion } from "./ambient_occlusion";
 import { Deformer, type DomainDisplay } from "./deformer";
 import { FullscreenPass } from "./fullscreen_pass";
 import { fitLightBox, type Lighting, lightAxes, lightingOf, lightOf, unitVector, upAxis } from "./lighting";
@@ -34,7 +35,7 @@ export interface RenderOptions {
     background: BackgroundChoice;
 }
 
-/** Linear gray behind color maps, as the server's, and linear white. */
+/** Linear gray behind color maps, equal to the server's, and linear white. */
 const PLAIN_GRAY = 0.87;
 const WHITE = 1;
 
@@ -45,6 +46,8 @@ export class SceneRenderer {
     private readonly shadowSize: number;
     private readonly surfaces: Surfaces;
     private readonly transparency: Transparency;
+    /** Null if the scene has no ambient occlusion. */
+    private readonly ambientOcclusion: AmbientOcclusion | null;
     private readonly background: FullscreenPass;
     private readonly plain: FullscreenPass;
     private readonly shadowTarget: THREE.WebGLRenderTarget;
@@ -74,7 +77,10 @@ export class SceneRenderer {
         this.restSpheres = arrays.shapes.map(restSphere);
         this.deformer = new Deformer(renderer, scene, arrays);
         this.shadowTarget = createShadowTarget(this.shadowSize);
+        const radius = this.lighting.ambientOcclusionRadius * this.diagonal;
+        this.ambientOcclusion = radius > 0 ? new AmbientOcclusion(renderer, isSoftware, radius) : null;
         this.light = this.createLight();
+        this.ambientOcclusion?.connect(this.light, this.lighting.ground !== null);
         const quality = { anisotropy: renderer.capabilities.getMaxAnisotropy(), blendsLevels: !isSoftware };
         this.transparency = new Transparency(renderer, isSoftware, this.tone);
         const { uniforms } = this.transparency;
@@ -96,12 +102,14 @@ export class SceneRenderer {
         this.options = { ...options, shadows: options.shadows && this.lighting.shadows };
         const isMap = options.color.kind !== "shaded";
         this.deformer.showMode(options.color.kind === "mode" ? options.color.mode : null);
-        this.surfaces.setShadows(this.options.shadows);
-        this.background.define("SHADOWS", this.options.shadows);
+        this.define("SHADOWS", this.options.shadows);
+        this.define("STUDIO", this.lighting.studio !== null);
+        this.define("AMBIENT_OCCLUSION", this.ambientOcclusion !== null && !isMap);
         this.surfaces.setEdges(options.edges);
         if (!isMap) this.surfaces.setColorMode({ kind: "shaded" });
-        this.surfaces.setLinearOutput(this.needsBlending);
-        for (const pass of this.backgrounds) pass.define("LINEAR_OUTPUT", this.needsBlending);
+        // `Transparency` blends light and converts it to pixel colors.
+        this.define("LINEAR_OUTPUT", this.needsBlending);
+        this.plain.define("LINEAR_OUTPUT", this.needsBlending);
         if (!this.needsBlending) this.transparency.release();
         // Color maps have no tone curve.
         this.setUniform(this.tone, "exposure", isMap ? 1 : this.lighting.exposure);
@@ -113,7 +121,13 @@ export class SceneRenderer {
         if (this.state) this.update(this.state);
     }
 
-    /** The light of a plain background, of which the tone curve makes the displayed color. */
+    /** Defines or undefines a macro of the shaders of surfaces and of the background. */
+    private define(name: string, isDefined: boolean): void {
+        this.surfaces.define(name, isDefined);
+        this.background.define(name, isDefined);
+    }
+
+    /** Output of the plain background: the displayed color, or the light that the tone curve maps to it. */
     private plainLight(): THREE.Vector3 {
         const displayed = this.options.background === "white" ? WHITE : PLAIN_GRAY;
         const isMap = this.options.color.kind !== "shaded";
@@ -166,8 +180,11 @@ export class SceneRenderer {
 
     render(camera: THREE.PerspectiveCamera): void {
         this.prepare(camera);
-        if (this.options.shadows && this.needsShadow && this.options.color.kind === "shaded") this.renderShadow();
-        const { colorScene, blendScene, blendMaterials } = this.surfaces;
+        const { colorScene, blendScene, blendMaterials, ambientScene } = this.surfaces;
+        if (this.options.color.kind === "shaded") {
+            if (this.options.shadows && this.needsShadow) this.renderShadow();
+            this.ambientOcclusion?.render(ambientScene, camera);
+        }
         if (this.needsBlending) {
             this.transparency.render({ opaque: colorScene, blended: blendScene, blendMaterials }, camera);
             return;
@@ -240,6 +257,7 @@ export class SceneRenderer {
         this.deformer.dispose();
         this.surfaces.dispose();
         this.transparency.dispose();
+        this.ambientOcclusion?.dispose();
         this.background.dispose();
         this.plain.dispose();
         this.shadowTarget.depthTexture?.dispose();
@@ -271,13 +289,11 @@ export class SceneRenderer {
         offset[axis] = 0;
         const fade = 3.5 * Math.max(this.diagonal, norm(offset));
         const relative = subtract(center, this.origin);
-        const uniforms = this.background.mesh.material.uniforms;
         const color = this.lighting.ground ?? [0, 0, 0];
-        if (uniforms["ground"]) uniforms["ground"].value = new THREE.Vector4(...color, fade);
-        if (uniforms["ground_center"]) {
-            uniforms["ground_center"].value = new THREE.Vector4(...relative, at(bounds, axis) - at(this.origin, axis));
-        }
-        if (uniforms["world_from_ndc"]) uniforms["world_from_ndc"].value = worldFromNdc(camera);
+        this.background.setUniform("ground", new THREE.Vector4(...color, fade));
+        const height = at(bounds, axis) - at(this.origin, axis);
+        this.setLight("ground_center", new THREE.Vector4(...relative, height));
+        this.setLight("world_from_ndc", worldFromNdc(camera));
     }
 
     private setLight(name: string, value: unknown): void {
@@ -292,8 +308,12 @@ export class SceneRenderer {
     private createLight(): Uniforms {
         const { lighting } = this;
         const vector = (value: Vec3) => ({ value: new THREE.Vector3(...value) });
+        const { studio } = lighting;
         return {
+            world_from_ndc: { value: new THREE.Matrix4() },
             eye: { value: new THREE.Vector3() },
+            up: vector(unitVector(upAxis(this.scene))),
+            ground_center: { value: new THREE.Vector4() },
             to_sun: vector(lighting.toSun),
             sunlight: vector(lighting.sunlight),
             skylight: vector(lighting.skylight),
@@ -304,18 +324,20 @@ export class SceneRenderer {
             shadow_texel: { value: 0 },
             shadow_bias: { value: 0 },
             map_scale: { value: 0 },
+            ...(studio && {
+                ambient_cube: { value: studio.ambientCube.map((color) => new THREE.Vector3(...color)) },
+                fill: vector(studio.fill),
+            }),
+            ...this.ambientOcclusion?.uniforms,
         };
     }
 
     private createBackground(): FullscreenPass {
         const vector = (value: Vec3) => new THREE.Vector3(...value);
         const pass = new FullscreenPass(BACKGROUND_FRAGMENT, {
-            world_from_ndc: new THREE.Matrix4(),
-            up: vector(unitVector(upAxis(this.scene))),
             zenith: vector(this.lighting.zenith),
             horizon: vector(this.lighting.horizon),
             ground: new THREE.Vector4(),
-            ground_center: new THREE.Vector4(),
         });
         Object.assign(pass.mesh.material.uniforms, this.light);
         pass.define("GROUND", this.lighting.ground !== null);

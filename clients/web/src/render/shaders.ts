@@ -1,19 +1,8 @@
 /** GLSL sources. Positions are in scene units relative to the render origin; colors are linear. */
 
-import { TABLE_WIDTH, WIDTH } from "./texture_tables";
-
-const PRECISION = `
-precision highp float;
-precision highp int;
-precision highp sampler2D;
-precision highp isampler2D;
-precision highp usampler2D;
-precision highp sampler2DShadow;
-`;
-
-const TABLE_LOOKUP = `
-ivec2 table_texel(int index) { return ivec2(index % ${TABLE_WIDTH}, index / ${TABLE_WIDTH}); }
-`;
+import { AMBIENT_LIGHT, AMBIENT_VISIBILITY } from "./ambient_shaders";
+import { DECODE_OCTAHEDRAL, FETCH_VERTEX, PRECISION, TABLE_LOOKUP } from "./shader_parts";
+import { WIDTH } from "./texture_tables";
 
 /** A triangle that covers the viewport. */
 export const FULLSCREEN_VERTEX = `${PRECISION}
@@ -82,14 +71,6 @@ void main() {
 }
 `;
 
-const FETCH_VERTEX = `
-uniform sampler2D positions;
-uniform sampler2D transforms;
-in uvec2 vertex;                     // index of the vertex in the scene, and of its domain
-${TABLE_LOOKUP}
-vec4 fetch_position() { return texelFetch(positions, ivec2(int(vertex.x) % ${WIDTH}, int(vertex.x) / ${WIDTH}), 0); }
-`;
-
 /** Vertices of surfaces. */
 export const SURFACE_VERTEX = `${PRECISION}
 ${FETCH_VERTEX}
@@ -103,12 +84,7 @@ out vec2 texture_uv;
 out float map_value;
 flat out float highlight;
 
-vec3 decode_octahedral(vec2 code) {
-    vec3 n = vec3(code, 1.0 - abs(code.x) - abs(code.y));
-    if (n.z < 0.0) n.xy = (1.0 - abs(n.yx)) * vec2(n.x < 0.0 ? -1.0 : 1.0, n.y < 0.0 ? -1.0 : 1.0);
-    return normalize(n);
-}
-
+${DECODE_OCTAHEDRAL}
 void main() {
     vec4 position = fetch_position();
     int row = 4 * int(vertex.y);
@@ -190,9 +166,9 @@ float sun_visibility(vec3 world, vec3 normal) { return 1.0; }
 `;
 
 /**
- * Phong shading with the formula of MaterialDescription, or a color map.
- * Defines: SHADOWS, COLOR_TEXTURE, NORMAL_TEXTURE, MASK, COLOR_MAP, LINEAR_OUTPUT, and BLEND for a layer of blended
- * surfaces (see `Transparency`), whose color is premultiplied.
+ * Phong shading with the formula of MaterialDescription, or a color map. Blended surfaces have no ambient occlusion.
+ * Defines: SHADOWS, STUDIO, AMBIENT_OCCLUSION, COLOR_TEXTURE, NORMAL_TEXTURE, MASK, COLOR_MAP, LINEAR_OUTPUT, and BLEND
+ * for a layer of blended surfaces (see `Transparency`), whose color is premultiplied.
  */
 export const SURFACE_FRAGMENT = `${PRECISION}
 in vec3 world;
@@ -200,9 +176,9 @@ in vec3 world_normal;
 in vec2 texture_uv;
 in float map_value;
 flat in float highlight;
+uniform mat4 world_from_ndc;         // from (x, y, 1) to the direction of a view ray
 uniform vec3 eye;
 uniform vec3 sunlight;
-uniform vec3 skylight;
 uniform vec3 ambient;
 uniform vec3 diffuse;
 uniform vec3 specular;
@@ -225,6 +201,8 @@ bool is_hidden() {
 }
 #endif
 ${SHADOW_LOOKUP}
+${AMBIENT_LIGHT}
+${AMBIENT_VISIBILITY}
 ${PIXEL_COLOR}
 #ifdef COLOR_MAP
 // viridis: Matt Zucker's polynomial (shadertoy.com/view/WlfXRN, CC0), as the server's color maps.
@@ -258,6 +236,10 @@ vec3 mapped_normal(vec3 n) {
 #endif
 
 void main() {
+    float sky_visibility = 1.0;
+#if defined(AMBIENT_OCCLUSION) && !defined(BLEND)
+    sky_visibility = ambient_visibility_of(world - eye, face_normal(dFdx(world), dFdy(world)), 1.0 / gl_FragCoord.w);
+#endif
     vec4 tint = vec4(1.0);
 #ifdef COLOR_TEXTURE
     tint = texture(color_texture, texture_uv);
@@ -282,7 +264,10 @@ void main() {
     vec3 light = facing * decode_srgb(viridis(clamp(map_value * map_scale, 0.0, 1.0)));
     opacity = 1.0;
 #else
-    vec3 light = skylight * ambient * tint.rgb;
+    vec3 light = sky_visibility * ambient_light(shading_normal) * ambient * tint.rgb;
+#ifdef STUDIO
+    light += max(dot(shading_normal, to_eye), 0.0) * fill * diffuse * tint.rgb;
+#endif
     float cosine = dot(shading_normal, to_sun);
     if (cosine > 0.0) {
         float reflected = dot(2.0 * dot(to_eye, shading_normal) * shading_normal - to_eye, to_sun);
@@ -300,7 +285,10 @@ void main() {
 }
 `;
 
-/** Sky and ground behind all surfaces, as the server draws them. Defines: SHADOWS, GROUND, LINEAR_OUTPUT. */
+/**
+ * Sky and ground behind all surfaces, as the server draws them.
+ * Defines: SHADOWS, STUDIO, AMBIENT_OCCLUSION, GROUND, LINEAR_OUTPUT.
+ */
 export const BACKGROUND_FRAGMENT = `${PRECISION}
 in vec2 ndc;
 uniform mat4 world_from_ndc;         // from (x, y, 1) to the direction of a view ray
@@ -309,11 +297,12 @@ uniform vec3 up;
 uniform vec3 zenith;
 uniform vec3 horizon;
 uniform vec3 sunlight;
-uniform vec3 skylight;
 uniform vec4 ground;                 // color; w: fade length D: the weight at distance d is exp(-(d / D)^2)
 uniform vec4 ground_center;          // w: height along the up axis
 out vec4 color;
 ${SHADOW_LOOKUP}
+${AMBIENT_LIGHT}
+${AMBIENT_VISIBILITY}
 ${PIXEL_COLOR}
 void main() {
     vec3 direction = mat3(world_from_ndc) * vec3(ndc, 1.0);
@@ -322,11 +311,16 @@ void main() {
 #ifdef GROUND
     float descent = -dot(direction, up), height = dot(eye, up) - ground_center.w;
     if (descent > 0.0 && height > 0.0) {
-        vec3 world = eye + height / descent * direction;
+        float depth = height / descent;
+        vec3 world = eye + depth * direction;
         vec3 offset = world - ground_center.xyz;
         offset -= dot(offset, up) * up;
         float weight = exp(-min(dot(offset, offset) / (ground.w * ground.w), 80.0));
-        vec3 ground_light = skylight + sun_visibility(world, up) * max(dot(up, to_sun), 0.0) * sunlight;
+        vec3 ambient = ambient_light(up);
+#ifdef AMBIENT_OCCLUSION
+        ambient *= ambient_visibility_of(depth * direction, up, depth);
+#endif
+        vec3 ground_light = ambient + sun_visibility(world, up) * max(dot(up, to_sun), 0.0) * sunlight;
         light = mix(horizon, ground_light * ground.rgb, weight);
     }
 #endif

@@ -5,6 +5,7 @@ import { AlphaMode, type MaterialDescription } from "../proto/modalcast/v1/scene
 import type { SceneArrays } from "../scene/arrays";
 import type { SceneDescription } from "../scene/description";
 import { at } from "../scene/numbers";
+import { AMBIENT_SURFACE_FRAGMENT, AMBIENT_SURFACE_VERTEX } from "./ambient_shaders";
 import type { Deformer } from "./deformer";
 import { setDefine } from "./fullscreen_pass";
 import { mipChain } from "./mip_chain";
@@ -50,10 +51,13 @@ export class Surfaces {
     readonly blendMaterials: THREE.RawShaderMaterial[] = [];
     readonly shadowScene = new THREE.Scene();
     readonly domainScene = new THREE.Scene();
+    /** Surfaces that occlude ambient light: those that are not blended. */
+    readonly ambientScene = new THREE.Scene();
     private readonly geometry: THREE.BufferGeometry;
     private readonly colorMaterials: THREE.RawShaderMaterial[] = [];
     private readonly shadowMaterials: THREE.RawShaderMaterial[] = [];
     private readonly domainMaterials: THREE.RawShaderMaterial[] = [];
+    private readonly ambientMaterials: THREE.RawShaderMaterial[] = [];
     private readonly textures = new Map<string, THREE.DataTexture>();
     private readonly blank: THREE.DataTexture;
     private readonly meshes: THREE.Mesh[];
@@ -94,6 +98,7 @@ export class Surfaces {
             mesh(select(true), this.blendScene),
             mesh(this.shadowMaterials, this.shadowScene),
             mesh(this.domainMaterials, this.domainScene),
+            mesh(this.ambientMaterials, this.ambientScene),
         ];
     }
 
@@ -105,17 +110,13 @@ export class Surfaces {
     }
 
     setColorMode(mode: ColorMode): void {
-        for (const material of this.colorMaterials) setDefine(material, "COLOR_MAP", mode.kind === "map");
+        this.define("COLOR_MAP", mode.kind === "map");
         if (mode.kind === "map") this.setLight("map_scale", mode.largest > 0 ? 1 / mode.largest : 0);
     }
 
-    /** Whether surfaces write light that `Transparency` blends, instead of the colors of pixels. */
-    setLinearOutput(isOn: boolean): void {
-        for (const material of this.colorMaterials) setDefine(material, "LINEAR_OUTPUT", isOn);
-    }
-
-    setShadows(isOn: boolean): void {
-        for (const material of this.colorMaterials) setDefine(material, "SHADOWS", isOn);
+    /** Defines or undefines a macro of SURFACE_FRAGMENT. */
+    define(name: string, isDefined: boolean): void {
+        for (const material of this.colorMaterials) setDefine(material, name, isDefined);
     }
 
     setEdges(isOn: boolean): void {
@@ -125,11 +126,17 @@ export class Surfaces {
             this.edges.position.copy(this.meshes[0]?.position ?? new THREE.Vector3());
         }
         if (this.edges) this.edges.visible = isOn;
+        // Only with lines, because the offset shows back faces along outlines. Blended surfaces have no lines, and
+        // their depths are compared with gl_FragCoord.z, which has no offset.
+        for (const material of this.colorMaterials) {
+            material.polygonOffset = isOn && !this.blendMaterials.includes(material);
+        }
     }
 
     dispose(): void {
         this.geometry.dispose();
-        for (const material of [...this.colorMaterials, ...this.shadowMaterials, ...this.domainMaterials])
+        const { colorMaterials, shadowMaterials, domainMaterials, ambientMaterials } = this;
+        for (const material of [...colorMaterials, ...shadowMaterials, ...domainMaterials, ...ambientMaterials])
             material.dispose();
         for (const texture of this.textures.values()) texture.dispose();
         this.blank.dispose();
@@ -192,8 +199,6 @@ export class Surfaces {
             {
                 side,
                 defines,
-                // Blended surfaces have no lines. Their depths are compared with gl_FragCoord.z, which has no offset.
-                polygonOffset: !blends,
                 polygonOffsetFactor: 0.5,
                 polygonOffsetUnits: 1,
             },
@@ -208,16 +213,14 @@ export class Surfaces {
         });
         // As on the server, blended surfaces cast a shadow where alpha is at least 0.5.
         if (blends) shadow.uniforms["cutoff"] = { value: 0.5 };
-        const domain = create(
-            DOMAIN_VERTEX,
-            DOMAIN_FRAGMENT,
-            {},
-            { side, defines: isMask ? { MASK: "" } : {}, visible: !blends },
-        );
+        const opaqueOnly = { side, defines: isMask ? { MASK: "" } : {}, visible: !blends };
+        const domain = create(DOMAIN_VERTEX, DOMAIN_FRAGMENT, {}, opaqueOnly);
+        const ambient = create(AMBIENT_SURFACE_VERTEX, AMBIENT_SURFACE_FRAGMENT, this.light, opaqueOnly);
         this.colorMaterials.push(color);
         if (blends) this.blendMaterials.push(color);
         this.shadowMaterials.push(shadow);
         this.domainMaterials.push(domain);
+        this.ambientMaterials.push(ambient);
     }
 
     /** @param cutoff Alpha from which the image is visible; 0 if the image cuts nothing out. */

@@ -1,6 +1,6 @@
 /**
- * Deflections |U q| of the domains of a scene, in meters. They are computed from the U in f32 that the viewer has
- * loaded, without the GPU.
+ * Deflections |A U q| of the domains of a scene in meters, with the linear part A of T. They are computed on the CPU
+ * from the loaded U in f32.
  */
 
 import { TRANSFORM_SIZE } from "./affine";
@@ -9,10 +9,12 @@ import { linearNorm, restSphere } from "./bounds";
 import { at } from "./numbers";
 import type { SceneModel } from "./scene_model";
 
-/** Largest number of entries of U that are read for the largest deflection of a scene. It takes about 5 ms. */
+/**
+ * Largest number of entries of U that are read for the largest deflection of a scene. Reading them takes about 5 ms.
+ */
 const MAX_ENTRIES = 3e6;
 
-/** Largest deflection, as a fraction of the size of a body, up to which sliders and pulls bend it: modes are linear. */
+/** Limit of sliders and pulls: deflection as a fraction of the body's size. Linear modes are wrong for larger ones. */
 export const LARGEST_DEFLECTION = 0.1;
 
 /** The vertices of a shape that are evaluated. */
@@ -27,7 +29,7 @@ interface EvaluatedVertices {
 }
 
 export class Deflections {
-    /** Every how many vertices one is evaluated. 1 unless the scene is large. */
+    /** One in this many vertices is evaluated. 1 unless the scene is large. */
     private readonly stride: number;
     private readonly evaluated: (EvaluatedVertices | undefined)[] = [];
 
@@ -45,8 +47,9 @@ export class Deflections {
     }
 
     /**
-     * Whether `largest` reads all vertices of a domain. Otherwise, it reads one of `stride` vertices and, for each mode,
-     * the vertex that moves most. Its result is then too small by about the difference between neighboring vertices.
+     * Whether `largest` reads all vertices of a domain. Otherwise, it reads one in `stride` vertices and, for each
+     * mode, the vertex that moves most. The result is then too small by about the difference between neighboring
+     * vertices.
      */
     isExact(domain: number): boolean {
         return this.evaluatedOf(domain)?.isComplete ?? true;
@@ -78,7 +81,7 @@ export class Deflections {
         return (this.evaluatedOf(domain)?.norms[mode] ?? 0) * this.metersPerUnit(domain);
     }
 
-    /** Largest norm of a vertex's row of U for one mode in all domains, in meters per unit of q. T does not scale it. */
+    /** Largest |U_k| of a vertex for a mode k in all domains, in meters per unit of q and without the scale of T. */
     largestOfMode(mode: number): number {
         const { domains, info } = this.model.scene;
         const norms = domains.map(({ domain }) => this.evaluatedOf(domain)?.norms[mode] ?? 0);

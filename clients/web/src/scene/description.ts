@@ -100,8 +100,8 @@ export function eigenvaluesOf(scene: SceneDescription, domain: number): readonly
 }
 
 /**
- * Largest eigenvalue of a mode that may be a rigid motion. Solvers return rounding errors for these; the physics process
- * holds such modes still.
+ * Largest eigenvalue of a mode that may be a rigid motion, for which solvers return rounding errors. The physics
+ * process does not move such modes.
  */
 export function largestRigidEigenvalue(eigenvalues: readonly number[]): number {
     return RIGID_TOLERANCE * eigenvalues.reduce((largest, value) => Math.max(largest, value), 0);

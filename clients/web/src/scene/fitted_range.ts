@@ -3,15 +3,15 @@
 import { niceAbove } from "./nice_numbers";
 
 /**
- * The scale shrinks to fit the values of the last two windows of this many milliseconds. They contain both extremes of a
- * vibration of 0.4 Hz or more.
+ * The scale shrinks to fit the values of the last two windows of this many milliseconds. Two windows contain both
+ * extremes of a vibration of 0.4 Hz or more.
  */
 const WINDOW_MS = 1500;
 
 /** The scale shrinks only to an end that the values may exceed by this factor, so that it does not grow again soon. */
 const MARGIN = 1.1;
 
-/** Smallest end as a fraction of the size of a body: below it, the scale would show rounding errors. The server's is the same. */
+/** Smallest end as a fraction of the size of a body, as on the server. A smaller scale would show rounding errors. */
 const SMALLEST = 1e-5;
 
 export class FittedRange {
@@ -36,7 +36,7 @@ export class FittedRange {
         this.end = Math.max(this.end, niceAbove(value));
         if (now - this.windowStart >= WINDOW_MS) {
             const fitting = niceAbove(MARGIN * Math.max(this.previous, this.current));
-            // Not after the first value and not after a pause, which is a long window of few values.
+            // It does not shrink after the first value or a pause, because such a window has few values.
             if (now - this.windowStart < 2 * WINDOW_MS) this.end = Math.max(this.smallest, Math.min(this.end, fitting));
             this.previous = this.current;
             this.current = value;

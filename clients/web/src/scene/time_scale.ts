@@ -12,13 +12,15 @@ const SHORTEST_MS = 1000;
 /** After a pause of this many milliseconds the measurement begins again. */
 const LONGEST_PAUSE_MS = 1000;
 
-/** Highest frequency in hertz of a vibration that is shown without slow motion, and that at which others are shown. */
+/**
+ * Vibrations of at most the first frequency in hertz need no slow motion. Faster ones are shown at about the second.
+ */
 const FASTEST_SHOWN_HERTZ = 5;
 const SLOW_HERTZ = 2;
 
 /**
- * Real seconds per second of a vibration of `hertz` in which it is seen, as `modalcast view` selects it for a model: 1, or
- * the nearest number 1, 2 or 5 times a power of ten.
+ * Slow motion factor that makes a vibration of `hertz` visible, in real per simulated seconds: 1, or the nearest number
+ * 1, 2 or 5 times a power of ten. `modalcast view` selects the same factor for a model.
  */
 export function slowFactor(hertz: number): number {
     if (!(hertz > FASTEST_SHOWN_HERTZ)) return 1;

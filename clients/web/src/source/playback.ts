@@ -8,7 +8,7 @@ import type { RecordedState, Recording } from "./recording";
 
 export class Playback {
     isPlaying = false;
-    /** Seconds of the recording per second. At first, a vibration of the lowest frequency is seen. */
+    /** Recorded per real seconds. The initial speed makes the lowest frequency visible. */
     speed: number;
     loops = true;
     /** Seconds since the first state. */

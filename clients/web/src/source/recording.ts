@@ -125,7 +125,7 @@ class RecordingCollector {
     }
 }
 
-/** The picture of a metadata record; null if the record is missing, or has no direction. */
+/** The picture of a metadata record; null if the record is missing or invalid. */
 function readView(record: Map<string, string> | undefined): PictureCamera | null {
     const numbers = (name: string) => (record?.get(name) ?? "").split(" ").map(Number.parseFloat);
     const number = (name: string) => at(numbers(name), 0);

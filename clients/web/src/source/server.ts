@@ -37,7 +37,7 @@ const HASHES_PER_REQUEST = 4096;
 /** Stage times arrive with every so many states: about twice per second at 60 steps per second. */
 const STAGES_EVERY = 30;
 
-/** Bytes of a part of an uploaded file. */
+/** Bytes of a chunk of an uploaded file. */
 const UPLOAD_PART = 256 << 10;
 
 /** Flow-control window of a picture stream in bytes. It admits one frame, so that a slow browser gets the newest. */
@@ -104,7 +104,7 @@ export class Server {
      * Uploads files, and opens them as a scene.
      *
      * @param entry The path to open; empty: the folder of all files.
-     * @param progress Called with the bytes of each part that was sent.
+     * @param progress Called with the number of bytes of each chunk that was sent.
      */
     async uploadScene(
         scene: string,
@@ -249,7 +249,7 @@ export class Server {
     }
 }
 
-/** Sends a file in parts. False if the server has ended the call before. */
+/** Sends a file in chunks. Returns false if the server ended the call before the last one. */
 async function sendFile(
     stream: UploadStream,
     { path, file }: UploadedFile,

@@ -1,4 +1,4 @@
-/** The axes of the world in a corner of the view. A click on the end of an axis looks along it. */
+/** The axes of the world in a corner of the view. A click on an end of an axis views the scene along it. */
 
 import type { OrbitCamera } from "../render/camera";
 import type { Vec3 } from "../scene/affine";
@@ -9,7 +9,7 @@ const SVG = "http://www.w3.org/2000/svg";
 const LENGTH = 34;
 const RADIUS = 9;
 const SMALL_RADIUS = 6;
-/** Radius that a click or a finger hits. */
+/** Radius of the clickable area around an end. */
 const HIT_RADIUS = 13;
 
 interface AxisEnd {

@@ -8,7 +8,7 @@ import type { Legend } from "./legend";
 import type { Notices } from "./notices";
 
 const TOPIC = "capture";
-/** Milliseconds for which the browser may read a file after the click on its link. */
+/** Milliseconds until the object URL of a saved file is revoked. */
 const LINK_MS = 60_000;
 
 export class Capture {
@@ -54,7 +54,7 @@ export class Capture {
         this.notices.show(TOPIC, "Recording a video of the view. Press the button again to save it.");
     }
 
-    /** Ends the video if another canvas shows the view than the one that is recorded. */
+    /** Ends the video if the recorded canvas does not show the view any more. */
     followView(name: string): void {
         if (this.recorder && this.recorder.canvas !== shownCanvas()) void this.saveVideo(name);
     }
@@ -72,13 +72,13 @@ export class Capture {
     }
 
     private setRecording(isRecording: boolean): void {
-        // A video has the frames that are drawn, so a scene at rest is drawn too.
+        // Only drawn frames are recorded, so a scene at rest is drawn continuously.
         this.viewport.drawsAlways = isRecording;
         this.onRecording(isRecording);
     }
 }
 
-/** The canvas that shows the view: that of the browser's drawing, or that of the server's pictures. */
+/** The visible canvas, which has the browser's drawing or the server's pictures. */
 function shownCanvas(): HTMLCanvasElement {
     const picture = byId<HTMLCanvasElement>("picture");
     return picture.hidden ? byId<HTMLCanvasElement>("surface") : picture;

@@ -13,7 +13,7 @@ import { ModeRow } from "./mode_row";
 /** Modes shown at a time. */
 const MAX_MODES = 40;
 
-/** The fastest animation of a mode in hertz, and that of a mode of unknown frequency. */
+/** Highest animation frequency in hertz, and the animation frequency of modes whose frequency is unknown. */
 const FASTEST_HERTZ = 1;
 const DEFAULT_HERTZ = 0.7;
 
@@ -32,7 +32,7 @@ export class CoordinateSection {
     private deflections: Deflections | null = null;
     private domain = 0;
     private rows: ModeRow[] = [];
-    /** Meters at the ends of all bars. */
+    /** Deflection in meters at the ends of all bars. */
     private barRange = new FittedRange(0);
     private animated: number | null = null;
     private canDrive = false;
@@ -130,7 +130,7 @@ export class CoordinateSection {
         for (const row of this.rows) row.setAnimated(this.animated === row.mode);
     }
 
-    /** Shows the current coordinates, unless nobody sees them. */
+    /** Shows the current coordinates if the section is visible. */
     update(): void {
         const { model, deflections } = this;
         if (!model || this.rows.length === 0 || !this.list.checkVisibility()) return;
@@ -151,10 +151,10 @@ export class CoordinateSection {
         const isExact = deflections.isExact(this.domain);
         const count = format.count(deflections.count(this.domain));
         setText(this.largest, `${isExact ? "" : "about "}${format.meters(deflections.largest(this.domain))}`);
-        this.largest.title = `The largest deflection of the part, |U q|, at ${isExact ? "all" : "a selection of"} ${count} vertices.`;
+        this.largest.title = `The largest distance of the part from its undeformed shape, at ${isExact ? "all" : "a selection of"} ${count} vertices.`;
     }
 
-    /** Meters at the ends of all sliders. */
+    /** Deflection in meters at the ends of all sliders. */
     private get sliderEnd(): number {
         return niceBelow(LARGEST_DEFLECTION * (this.deflections?.size(this.domain) ?? 0));
     }

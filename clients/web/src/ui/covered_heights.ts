@@ -1,4 +1,4 @@
-/** How much of the view the bar at the top and the buttons at the bottom cover. */
+/** Heights of the view that the bar at the top and the buttons at the bottom cover, in pixels. */
 
 import { byId } from "./dom";
 

@@ -2,7 +2,7 @@
 
 import type { UploadedFile } from "../source/server";
 
-/** Calls `open` with the files of each drop. A dropped folder gives all files in it. */
+/** Calls `open` with the files of each drop. Of a dropped folder, these are all files that are not hidden. */
 export function listenToDrops(open: (files: UploadedFile[]) => void): void {
     const highlight = (isOver: boolean) => document.body.classList.toggle("dropping", isOver);
     window.addEventListener("dragover", (event) => {
@@ -10,13 +10,13 @@ export function listenToDrops(open: (files: UploadedFile[]) => void): void {
         highlight(event.dataTransfer?.types.includes("Files") ?? false);
     });
     window.addEventListener("dragleave", (event) => {
-        // Between two elements of the page, the event has the element that the pointer enters.
+        // `relatedTarget` is null only if the pointer leaves the page, not if it enters another element.
         if (event.relatedTarget === null) highlight(false);
     });
     window.addEventListener("drop", (event) => {
         event.preventDefault();
         highlight(false);
-        // The items exist during the event only, so their entries are taken at once.
+        // The items are valid only during the event, so their entries are read here.
         const items = [...(event.dataTransfer?.items ?? [])].filter(({ kind }) => kind === "file");
         const dropped = items.map((item) => ({ entry: item.webkitGetAsEntry?.() ?? null, file: item.getAsFile() }));
         void readDropped(dropped).then((files) => files.length > 0 && open(files));
@@ -28,7 +28,7 @@ interface DroppedItem {
     file: File | null;
 }
 
-/** All files. The paths of a single folder are relative to it. */
+/** Reads all dropped files. If a single folder was dropped, the paths are relative to it. */
 async function readDropped(items: DroppedItem[]): Promise<UploadedFile[]> {
     const files: UploadedFile[] = [];
     for (const { entry, file } of items) {
@@ -44,7 +44,7 @@ async function readFolder(folder: FileSystemDirectoryEntry, prefix: string): Pro
     const reader = folder.createReader();
     const files: UploadedFile[] = [];
     for (;;) {
-        // Each call returns some of the entries, and the last one none.
+        // Each call returns some of the entries, and the last call returns none.
         const entries = await new Promise<FileSystemEntry[]>((done, fail) => reader.readEntries(done, fail));
         if (entries.length === 0) return files;
         for (const entry of entries) {

@@ -53,7 +53,7 @@ export class ForceLines {
     }
 }
 
-/** The force and its limit, the deflection of the point and, at the limit, its reason. */
+/** The force and its limit, the deflection of the point and, at the limit, the reason for the limit. */
 function pullText({ newtons, limit, deflection, isLimited }: PullView): string {
     const reason = isLimited ? `\nThe limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.` : "";
     return `${format.limitedNewtons(newtons, limit)}\n${format.meters(deflection)}${reason}`;

@@ -30,7 +30,7 @@ export function newtons(value: number): string {
     return size >= 1e3 ? `${short(value / 1e3)} kN` : `${short(value)} N`;
 }
 
-/** A force in newtons and the largest one at its point; null if that is unknown, infinite if nothing bends. */
+/** A force and its limit in newtons. The limit is null if it is unknown, and infinite if nothing bends. */
 export function limitedNewtons(value: number, limit: number | null): string {
     if (limit === null) return `${newtons(value)}, limit unknown`;
     return Number.isFinite(limit) ? `${newtons(value)} of at most ${newtons(limit)}` : newtons(value);

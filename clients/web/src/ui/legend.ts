@@ -30,7 +30,11 @@ export class Legend {
         this.element.hidden = true;
     }
 
-    /** Draws the visible legend into the lower left corner of a picture. `scale`: pixels of the picture per CSS pixel. */
+    /**
+     * Draws the legend, if it is visible, into the lower left corner of a picture.
+     *
+     * @param scale Pixels of the picture per CSS pixel.
+     */
     paint(context: CanvasRenderingContext2D, scale: number): void {
         if (this.element.hidden) return;
         const [margin, width, bar] = [14, 184, 10];

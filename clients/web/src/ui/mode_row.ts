@@ -4,13 +4,13 @@ import { h, setText } from "./dom";
 import * as format from "./format";
 import { icon } from "./icons";
 
-/** Milliseconds after the last key press in which a slider keeps its value: the state that shows it may arrive later. */
+/** Milliseconds after an input in which a slider keeps its value, because the state with this value arrives later. */
 const INPUT_MS = 1000;
 
 /** Steps of a slider from its middle to an end. */
 const STEPS = 200;
 
-/** The number of a mode for people, from 1, and its frequency in hertz if it is known. */
+/** Label of a mode: its number, counted from 1, and its frequency if it is known. */
 export function modeName(mode: number, hertz: number): string {
     return `Mode ${mode + 1}${hertz > 0 ? `, ${format.frequency(hertz)}` : ""}`;
 }
@@ -50,7 +50,7 @@ export class ModeRow {
         this.element = h("div", { className: "mode" }, name, this.value, this.play, track, this.slider);
     }
 
-    /** Shows a slider on the bar. */
+    /** Shows a slider on the bar if this viewer can drive the scene. */
     setCanDrive(canDrive: boolean): void {
         this.slider.hidden = !canDrive;
         this.play.disabled = !canDrive;

@@ -5,7 +5,7 @@ import { byId } from "./dom";
 export interface OverlayLine {
     from: [number, number];
     to: [number, number];
-    /** Lines that are separated by "\n". */
+    /** "\n" separates its lines. */
     text: string;
     isOwn: boolean;
 }
@@ -18,7 +18,7 @@ const LINE_HEIGHT = 17;
 /** Pixels between a text and the right edge of the view. */
 const MARGIN = 8;
 
-/** Pixels at the top of the view that the bar may cover: a text is then below its arrow. */
+/** Height in pixels that the bar may cover. A text that would be in this area is placed below its arrow. */
 const TOP = 60;
 
 /** Length and half width of an arrow's head in pixels. */

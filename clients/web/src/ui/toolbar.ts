@@ -50,7 +50,7 @@ export class Toolbar {
         this.updateSeparators();
     }
 
-    /** Hides the separators of groups without visible buttons before them. */
+    /** Hides each separator that has no visible button before it since the previous separator. */
     private updateSeparators(): void {
         let hasButton = false;
         for (const child of this.element.children as HTMLCollectionOf<HTMLElement>) {

@@ -47,7 +47,7 @@ export class Call {
         return this.waiting.length;
     }
 
-    /** Resolves when no message waits for credit: true if the call still takes messages, false if it has ended. */
+    /** Resolves when no message waits for credit, with false if the call has ended and accepts no more messages. */
     async drained(): Promise<boolean> {
         while (!this.hasEnded && this.waiting.length > 0) {
             await new Promise<void>((resolve) => {

@@ -30,12 +30,12 @@ export interface ReplyStream<T> extends AsyncIterable<T> {
     cancel(): void;
 }
 
-/** Both directions of a stream of the client. */
+/** A call in which the client sends several messages: client streaming or bidirectional. */
 export interface DuplexStream<I, O> extends ReplyStream<O> {
     send(message: I): void;
     /** Number of messages that wait for flow control. */
     readonly backlog: number;
-    /** Resolves when no message waits: true if the call still takes messages, false if it has ended. */
+    /** Resolves when no message waits for credit, with false if the call has ended and accepts no more messages. */
     drained(): Promise<boolean>;
     end(): void;
 }

@@ -193,6 +193,17 @@ async function serveCommittedPage(page: Page): Promise<void> {
     await page.route(isPage, (route) => route.fulfill({ body: committedPage(), contentType: "text/html" }));
 }
 
+/** Lets WebGL report the name of a GPU in the next document of a page, for which the viewer draws more samples and layers. */
+export async function simulateGpu(page: Page): Promise<void> {
+    await page.addInitScript(() => {
+        const original = WebGL2RenderingContext.prototype.getParameter;
+        WebGL2RenderingContext.prototype.getParameter = function (name) {
+            const isRenderer = name === 0x9246 || name === WebGL2RenderingContext.RENDERER;
+            return isRenderer ? "GPU of a test" : original.call(this, name);
+        };
+    });
+}
+
 /** Folder for screenshots of some tests; empty: none. */
 const SCREENSHOTS = process.env["MODALCAST_SCREENSHOTS"] ?? "";
 

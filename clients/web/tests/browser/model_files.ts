@@ -1,4 +1,4 @@
-/** Model files that tests of `modalcast view` write: a beam as a NumPy archive or an STL file. */
+/** Model files that tests write: a beam as a NumPy archive or an STL file, and a bracket as an STL file. */
 
 import { crc32 } from "node:zlib";
 
@@ -61,12 +61,60 @@ export class Beam {
 
     stl(): string {
         const vertices = this.vertices;
-        const facet = (face: number[]) =>
-            `facet normal 0 0 0\nouter loop\n${face
-                .map((vertex) => `vertex ${vertices[vertex]?.join(" ")}\n`)
-                .join("")}endloop\nendfacet\n`;
-        return `solid beam\n${this.faces.map(facet).join("")}endsolid beam\n`;
+        return stl(this.faces.map((face) => face.map((vertex) => vertices[vertex] ?? [])));
     }
+}
+
+/** @param triangles Three corners each. */
+function stl(triangles: number[][][]): string {
+    const facet = (corners: number[][]) =>
+        `facet normal 0 0 0\nouter loop\n${corners
+            .map((corner) => `vertex ${corner.join(" ")}\n`)
+            .join("")}endloop\nendfacet\n`;
+    return `solid part\n${triangles.map(facet).join("")}endsolid part\n`;
+}
+
+/** The sides and both ends of a prism with a convex, counterclockwise base, moved by `along`. */
+function prism(base: number[][], along: number[]): number[][][] {
+    const top = base.map((corner) => corner.map((value, axis) => value + (along[axis] ?? 0)));
+    const at = (ring: number[][], index: number) => ring[index % ring.length] ?? [];
+    const sides = base.flatMap((_, i) => [
+        [at(base, i), at(base, i + 1), at(top, i + 1)],
+        [at(base, i), at(top, i + 1), at(top, i)],
+    ]);
+    const ends = base.slice(2).flatMap((_, i) => [
+        [at(base, 0), at(base, i + 2), at(base, i + 1)],
+        [at(top, 0), at(top, i + 1), at(top, i + 2)],
+    ]);
+    return [...sides, ...ends];
+}
+
+/** An angle bracket with a rib and two round bosses, z up. */
+export function bracketStl(): string {
+    const plate = (width: number, depth: number, z: number) => [
+        [0, 0, z],
+        [width, 0, z],
+        [width, depth, z],
+        [0, depth, z],
+    ];
+    const rib = [
+        [0.1, 0.36, 0.1],
+        [0.6, 0.36, 0.1],
+        [0.1, 0.36, 0.6],
+    ];
+    const circle = (x: number, y: number) =>
+        Array.from({ length: 48 }, (_, i) => (2 * Math.PI * i) / 48).map((angle) => [
+            x + 0.12 * Math.cos(angle),
+            y + 0.12 * Math.sin(angle),
+            0.1,
+        ]);
+    return stl([
+        ...prism(plate(1.2, 0.8, 0), [0, 0, 0.1]),
+        ...prism(plate(0.1, 0.8, 0.1), [0, 0, 0.8]),
+        ...prism(rib, [0, 0.08, 0]),
+        ...prism(circle(0.85, 0.2), [0, 0, 0.2]),
+        ...prism(circle(0.85, 0.6), [0, 0, 0.2]),
+    ]);
 }
 
 /** A NumPy array of float64. `isVector` drops the second axis, whose length is 1. */

@@ -1,29 +1,71 @@
-/** Pictures that the browser and the server draw: RGBA values of 0 to 255, top row first. */
+/** Pictures that the browser and the server draw: RGBA values of 0 to 255, or domains, top row first. */
 
+import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { Page } from "playwright-core";
-import { Format, FrameService } from "../../src/proto/modalcast/v1/frames_pb";
+import { Format, FrameService, Output, type PictureSchema } from "../../src/proto/modalcast/v1/frames_pb";
 import type { CameraMessage } from "../../src/render/camera";
 import type { Server } from "../../src/source/server";
+
+/** In a picture of domains: no surface. */
+export const NO_DOMAIN = 0xffffffff;
 
 /** The camera of a page. */
 export function cameraOf(page: Page): Promise<CameraMessage> {
     return page.evaluate(() => modalcastViewer.viewport.camera.toMessage());
 }
 
-/** What the server draws. */
+/** What the server draws. `camera`: undefined for the server's default camera. */
 export async function serverPicture(
+    server: Server,
+    scene: string,
+    camera: CameraMessage | undefined,
+    [width, height]: readonly [number, number],
+    samples = 1,
+): Promise<Uint8Array> {
+    // Streams of this size have one sample per pixel on a CPU, single frames have four by default.
+    return renderFrame(server, scene, { width, height, format: Format.RGBA, samples, ...(camera && { camera }) });
+}
+
+/** The domain at each pixel, drawn by the server. */
+export async function serverDomains(
     server: Server,
     scene: string,
     camera: CameraMessage,
     [width, height]: readonly [number, number],
-): Promise<Uint8Array> {
-    // Streams of this size have one sample per pixel on a CPU, single frames have four by default.
-    const request = { scene, pictures: [{ width, height, camera, format: Format.RGBA, samples: 1 }] };
-    const bytes = new Uint8Array(4 * width * height);
+): Promise<Uint32Array> {
+    const bytes = await renderFrame(server, scene, { width, height, camera, output: Output.DOMAINS });
+    return new Uint32Array(bytes.buffer);
+}
+
+type Picture = MessageInitShape<typeof PictureSchema> & { width: number; height: number };
+
+async function renderFrame(server: Server, scene: string, picture: Picture): Promise<Uint8Array> {
+    const request = { scene, pictures: [picture] };
+    const bytes = new Uint8Array(4 * picture.width * picture.height);
     for await (const { part } of server.channel.serverStream(FrameService.method.renderFrame, request)) {
         if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
     }
     return bytes;
+}
+
+/** The domain at each pixel, drawn by the browser. */
+export async function drawnDomains(page: Page, size: readonly [number, number]): Promise<number[]> {
+    return page.evaluate(([width, height]) => {
+        const { renderer, viewport } = modalcastViewer;
+        return Array.from(renderer?.domainIds(viewport.camera.camera, width, height) ?? []);
+    }, size);
+}
+
+/** Intersection over union: pixels with the same domain among those where either picture has a domain. */
+export function iou(a: ArrayLike<number>, b: ArrayLike<number>): number {
+    let both = 0;
+    let either = 0;
+    for (let pixel = 0; pixel < a.length; pixel++) {
+        if (a[pixel] === NO_DOMAIN && b[pixel] === NO_DOMAIN) continue;
+        either++;
+        if (a[pixel] === b[pixel]) both++;
+    }
+    return both / either;
 }
 
 /** What the browser draws. */

@@ -5,7 +5,7 @@ import { test } from "node:test";
 import type { Page } from "playwright-core";
 import type { SurfacePoint } from "../../src/control/surface_point";
 import { Delivery } from "../../src/proto/modalcast/v1/common_pb";
-import { FrameService, type Hit, Output } from "../../src/proto/modalcast/v1/frames_pb";
+import { FrameService, type Hit } from "../../src/proto/modalcast/v1/frames_pb";
 import type { CameraMessage } from "../../src/render/camera";
 import { fitBox } from "../../src/render/framing";
 import { normalized } from "../../src/render/lighting";
@@ -14,12 +14,12 @@ import { parseArrays } from "../../src/scene/arrays";
 import { Kinematics } from "../../src/scene/kinematics";
 import { SceneModel } from "../../src/scene/scene_model";
 import { end, startSimulation } from "./harness";
-import { cameraOf, meanDifference, serverPicture } from "./pictures";
+import { cameraOf, drawnDomains, iou, meanDifference, NO_DOMAIN, serverDomains, serverPicture } from "./pictures";
 import { TreeSetup } from "./tree_setup";
 
 const WIDTH = 480;
 const HEIGHT = 300;
-const NO_DOMAIN = 0xffffffff;
+const SIZE = [WIDTH, HEIGHT] as const;
 /** A test that takes longer has failed. Alone on two cores, each takes less than a minute. */
 const LIMIT_MS = 300_000;
 
@@ -80,40 +80,6 @@ async function viewFrom(page: Page, fraction: number): Promise<void> {
     await page.evaluate(([from, to]) => modalcastViewer.viewport.camera.look(from, to), [closer, target] as const);
 }
 
-/** The domain at each pixel, drawn by the browser. */
-async function drawnDomains(page: Page): Promise<number[]> {
-    return page.evaluate(
-        ([width, height]) => {
-            const { renderer, viewport } = modalcastViewer;
-            return Array.from(renderer?.domainIds(viewport.camera.camera, width as number, height as number) ?? []);
-        },
-        [WIDTH, HEIGHT],
-    );
-}
-
-/** The domain at each pixel, drawn by the server. */
-async function referenceDomains(camera: CameraMessage): Promise<Uint32Array> {
-    const request = { scene: "tree", pictures: [{ width: WIDTH, height: HEIGHT, camera, output: Output.DOMAINS }] };
-    const bytes = new Uint8Array(4 * WIDTH * HEIGHT);
-    const { channel } = await server.client();
-    for await (const { part } of channel.serverStream(FrameService.method.renderFrame, request)) {
-        if (part.case === "chunk") bytes.set(part.value.data, Number(part.value.offset));
-    }
-    return new Uint32Array(bytes.buffer);
-}
-
-/** Intersection over union: pixels with the same domain among those where either picture has a domain. */
-function iou(a: ArrayLike<number>, b: ArrayLike<number>): number {
-    let both = 0;
-    let either = 0;
-    for (let pixel = 0; pixel < a.length; pixel++) {
-        if (a[pixel] === NO_DOMAIN && b[pixel] === NO_DOMAIN) continue;
-        either++;
-        if (a[pixel] === b[pixel]) both++;
-    }
-    return both / either;
-}
-
 /** Hits at pixels that are spread over the picture. */
 async function pickMany(camera: CameraMessage, count: number): Promise<Hit[]> {
     const hits: Hit[] = [];
@@ -165,7 +131,8 @@ test("the browser draws the same domains and points as the server", { timeout: L
     await waitForStep(page, number);
     await viewFrom(page, 0.08);
     const camera = await cameraOf(page);
-    const [drawn, reference] = [await drawnDomains(page), await referenceDomains(camera)];
+    const reference = await serverDomains(await server.client(), "tree", camera, SIZE);
+    const drawn = await drawnDomains(page, SIZE);
     const same = iou(drawn, reference);
     assert.ok(
         reference.some((domain) => domain !== NO_DOMAIN),
@@ -181,10 +148,13 @@ test("the browser draws the same domains and points as the server", { timeout: L
     assert.ok(Math.max(...distances) <= 1, `expected points within 1 pixel, got ${Math.max(...distances)}`);
     // Control: another q moves the masks.
     const other = await bend(-1);
-    const moved = iou(drawn, await referenceDomains(camera));
+    const moved = iou(drawn, await serverDomains(await server.client(), "tree", camera, SIZE));
     assert.ok(moved < 0.9, `expected an IoU below 0.9 with another q, got ${moved}`);
     await waitForStep(page, other);
-    const followed = iou(await drawnDomains(page), await referenceDomains(camera));
+    const followed = iou(
+        await drawnDomains(page, SIZE),
+        await serverDomains(await server.client(), "tree", camera, SIZE),
+    );
     assert.ok(followed >= 0.99, `expected an IoU of 0.99 after the next step, got ${followed}`);
     console.log(
         `IoU ${same.toFixed(4)}, control ${moved.toFixed(4)}, largest distance ${Math.max(...distances).toFixed(3)} pixels`,

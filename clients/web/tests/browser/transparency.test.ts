@@ -5,7 +5,7 @@ import { mkdirSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
-import { launchBrowser, openPage, ServerProcess, temporaryFolder, waitForScene } from "./harness";
+import { launchBrowser, openPage, ServerProcess, simulateGpu, temporaryFolder, waitForScene } from "./harness";
 import { browserPicture, cameraOf, meanDifference, serverPicture } from "./pictures";
 
 const SIZE = [480, 300] as const;
@@ -117,15 +117,7 @@ function largestDifference(a: readonly number[][], b: readonly number[][]): numb
 for (const device of ["CPU", "GPU"] as const) {
     test(`transparent surfaces are blended in linear light, as on a ${device}`, { timeout: LIMIT_MS }, async () => {
         const { page, errors } = await openPage(browser, "about:blank", ...SIZE);
-        // With the name of a GPU, the viewer draws more samples and layers.
-        if (device === "GPU")
-            await page.addInitScript(() => {
-                const original = WebGL2RenderingContext.prototype.getParameter;
-                WebGL2RenderingContext.prototype.getParameter = function (name) {
-                    const isRenderer = name === 0x9246 || name === WebGL2RenderingContext.RENDERER;
-                    return isRenderer ? "GPU of a test" : original.call(this, name);
-                };
-            });
+        if (device === "GPU") await simulateGpu(page);
         await page.goto(server.pageUrl("layers"), { waitUntil: "commit" });
         await waitForScene(page);
         assert.equal(await page.evaluate(() => modalcastViewer.viewport.isSoftware), device === "CPU");
