@@ -32,10 +32,15 @@ export function committedPage(): string {
     return gunzipSync(readFileSync(join(process.cwd(), "dist/index.html.gz"))).toString();
 }
 
+const temporaryFolders: string[] = [];
+process.once("exit", () => {
+    for (const folder of temporaryFolders) rmSync(folder, { recursive: true, force: true });
+});
+
 /** A folder that the process removes when it ends. */
 export function temporaryFolder(): string {
     const folder = mkdtempSync(join(tmpdir(), "modalcast-viewer-"));
-    process.once("exit", () => rmSync(folder, { recursive: true, force: true }));
+    temporaryFolders.push(folder);
     return folder;
 }
 
