@@ -1,5 +1,5 @@
-// Filters the noise of the ambient occlusion: averages a square with sides of AMBIENT_NOISE texels around the texel, whose
-// slice directions all differ.
+// Filters the noise of the ambient occlusion: averages a square of AMBIENT_NOISE x AMBIENT_NOISE texels, whose slice
+// directions all differ. The center of the square is half a texel to the left of the texel and half a texel below it.
 //   surface             (in)   see ambient_surface.comp
 //   noisy_visibility    (in)   see ambient_occlusion.comp
 //   ambient_visibility  (out)  of the same size  RG32F: visibility, 0 to 1; 1 / depth, 0 for the sky

@@ -1,9 +1,10 @@
 // Ambient occlusion by horizon angles: Jimenez, Wu, Pesce and Jarabo, "Practical Real-Time Strategies for Accurate
 // Indirect Occlusion", SIGGRAPH 2016 courses (GTAO). A slice is a plane through the view ray. The visible part of the
 // hemisphere in a slice lies between two horizons, one on each side, and its cosine-weighted integral has a closed
-// form. Each side samples STEPS surface points. A point above the horizon raises it. The arc between the old and the
-// new horizon is occluded with the weight 1 - (d / R)^2, the mean over the points at its ends, where d is the distance of
-// a point. The visibility is the ratio of the integrals with and without occluders over SLICES slices.
+// form. Each side samples STEPS surface points. A point above the horizon raises it. A point at the
+// distance d has the weight 1 - (d / R)^2. The arc between the old and the new horizon is occluded with the mean weight
+// of the points at its ends. The visibility is the ratio of the integrals with and without occluders over SLICES
+// slices.
 //   surface           (in)   see ambient_surface.comp
 //   noisy_visibility  (out)  of the same size  RG32F: visibility, 0 to 1; 1 / depth, 0 for the sky
 // The directions and distances of the points differ within each square of AMBIENT_NOISE x AMBIENT_NOISE texels.
