@@ -15,12 +15,13 @@
 //! | `modalcast` (`src`) | the server: gRPC services, engine, command line | `modalcast-compute`, `modalcast-render`, `modalcast-model`, `modalcast-proto` |
 //! | `modalcast-compute` (`src/compute`) | deformers for CUDA and the CPU, and an f64 reference; exports its kernels | `modalcast-model` |
 //! | `modalcast-render` (`src/render`) | the renderer: EGL and OpenGL buffers, passes and readback | `modalcast-model` |
-//! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | |
+//! | `modalcast-model` (`src/model`) | scenes, their file formats, the traits of deformers and rasterizers | `modalcast-beam` |
+//! | `modalcast-beam` (`src/beam`) | modes and inertia of beams, for branches and leaves | |
 //!
 //! Further crates: `proto` (the gRPC contract), `clients/rust`, `clients/dynamics` and `clients/recording` (they use none
 //! of the crates in the table; the last one is started by `modalcast record` and `replay`), `clients/modes` (modes of
-//! surfaces by finite elements, started by `modalcast model` and `view`; it uses `modalcast-model` for its loaders), and
-//! `tests/bench` (all benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
+//! surfaces and volume meshes by finite elements, started by `modalcast model` and `view`; it uses `modalcast-model` for
+//! its loaders), and `tests/bench` (all benchmarks, started by `modalcast report`). `clients/python` is a client in Python.
 //!
 //! # Modules
 //! A test (`tests/it/layering.rs`) reads this table. It checks that a module uses only the modules in its row and that
@@ -54,8 +55,9 @@
 //! | `modalcast-render::region` | rectangles of a frame that are drawn or cleared | |
 //! | `modalcast-render::types` | parameters and results of the renderer | `pass` |
 //! | `modalcast-render::pass` | names of the passes and stages, and their times | |
-//! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plant scans with one object per organ, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `backend_settings`, `scene`, `domain`, `memory`, `rounding`, `error` |
-//! | `modalcast-model::tree` | the built-in scene: a tree of beams, the modes of the beams, and the surface mesh that they deform | `scene`, `domain`, `error` |
+//! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plants with one object per organ and their modes, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `beam_shape`, `backend_settings`, `scene`, `domain`, `memory`, `rounding`, `error` |
+//! | `modalcast-model::tree` | the built-in scene: a tree of beams, and the surface mesh that they deform | `beam_shape`, `scene`, `domain`, `error` |
+//! | `modalcast-model::beam_shape` | meshes that follow the sections of beams, and the inertia of beams | `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::shared_memory` | the traits of device memory that OpenGL and CUDA share, and of its copies to the host | `error` |
@@ -66,6 +68,16 @@
 //! | `modalcast-model::fault_injection` | planned faults of devices, for tests of the recovery; empty without the feature `fault-injection` | `error` |
 //! | `modalcast-model::rounding` | numbers in messages | |
 //! | `modalcast-model::error` | the error type, with variants for errors of the caller, of the operator and of the server | |
+//! | `modalcast-beam::similarity` | rotated and scaled copies of beams | `beam`, `profile`, `inertia`, `station` |
+//! | `modalcast-beam::polyline` | beams along polylines with radii | `beam`, `station`, `profile`, `error` |
+//! | `modalcast-beam::beam` | the modes of a clamped beam that carries rigid bodies, and its inertia | `element`, `band`, `inertia`, `station`, `profile`, `frame_model`, `error` |
+//! | `modalcast-beam::element` | stiffness and mass of one element | `inertia`, `profile` |
+//! | `modalcast-beam::frame_model` | an independent model of a beam, for tests | `inertia`, `profile` |
+//! | `modalcast-beam::band` | symmetric band matrices | |
+//! | `modalcast-beam::inertia` | the inertia of a rigid body | |
+//! | `modalcast-beam::station` | positions along a beam | |
+//! | `modalcast-beam::profile` | cross sections and materials | |
+//! | `modalcast-beam::error` | the error type of the beams | |
 //!
 //! # Invariants
 //! 1. No module or crate depends on a higher tier.

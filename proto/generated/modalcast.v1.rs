@@ -768,6 +768,30 @@ pub struct DomainDescription {
     /// origin that `placement` rounds its place.
     #[prost(double, repeated, tag = "16")]
     pub exact_placement: ::prost::alloc::vec::Vec<f64>,
+    /// Mass properties of the domain's own material, without the domains that are attached to it; unset if unknown.
+    #[prost(message, optional, tag = "17")]
+    pub inertia: ::core::option::Option<Inertia>,
+}
+/// Kinetic energy of a domain that moves by R X + U q: 1/2 \[X', q'\]^T \[R^T M R, R^T M U\], [U^T M R, U^T M U](<R^T M R, R^T M U], [U^T M R, U^T M U>) \[X', q'\]. X is
+/// the small motion of the domain's frame in its own axes: translation of its origin, then rotation vector. R are the rigid
+/// motions about the origin, and M is the mass of the domain.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Inertia {
+    /// kg.
+    #[prost(double, tag = "1")]
+    pub mass: f64,
+    /// Center of mass at rest: three numbers in scene units, in the domain's own frame.
+    #[prost(double, repeated, tag = "2")]
+    pub center: ::prost::alloc::vec::Vec<f64>,
+    /// Six entries of the inertia tensor about the frame's origin, xx, yy, zz, xy, xz, yz, in kg scene units^2.
+    #[prost(double, repeated, tag = "3")]
+    pub moments: ::prost::alloc::vec::Vec<f64>,
+    /// R^T M U: 6 x r numbers, row-major. Momentum, and angular momentum about the origin, per unit rate of each coordinate.
+    #[prost(double, repeated, tag = "4")]
+    pub modal_momenta: ::prost::alloc::vec::Vec<f64>,
+    /// U^T M U: r x r numbers, row-major.
+    #[prost(double, repeated, tag = "5")]
+    pub modal_masses: ::prost::alloc::vec::Vec<f64>,
 }
 /// Consecutive triangles with one material. A range ends where the next one begins.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -5224,6 +5248,11 @@ pub struct AppliedForce {
     /// f32 becomes infinite.
     #[prost(bytes = "bytes", tag = "3")]
     pub f_q: ::prost::bytes::Bytes,
+    /// The point of a surface force at rest, x0 interpolated at the point: three numbers in scene units, in the domain's own
+    /// frame. A physics process computes from it how the force acts on the frame of the domain, and so on the domains that
+    /// carry it. Empty for a modal force, which acts on the coordinates of its domain alone.
+    #[prost(double, repeated, tag = "4")]
+    pub rest_point: ::prost::alloc::vec::Vec<f64>,
 }
 /// Generated client implementations.
 pub mod force_service_client {

@@ -5,6 +5,7 @@
 #![cfg_attr(not(test), deny(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::print_stdout))]
 
 pub mod backend_settings;
+mod beam_shape;
 pub mod deform;
 pub mod domain;
 pub mod error;

@@ -15,7 +15,7 @@ use super::convert::{parse_hashes, wire_scene_info};
 use super::status::to_status;
 use super::stream::{ReplySender, ReplyStream, respond};
 use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, run_blocking};
-use modalcast_model::domain::{AlphaMode, Domain, Material, MaterialRange, Transform};
+use modalcast_model::domain::{AlphaMode, Domain, Inertia, Material, MaterialRange, Transform};
 use modalcast_model::error::{Error, Result, invalid};
 use modalcast_model::scene::Scene;
 
@@ -424,6 +424,7 @@ impl Description<'_> {
                 .then(|| v1::Eigenvalues { values: eigenvalues.clone() }),
             notes: domain.metadata.notes.clone().into_iter().collect(),
             exact_placement: exact_placement(domain),
+            inertia: domain.metadata.inertia.as_ref().map(wire_inertia),
         }
     }
 }
@@ -476,6 +477,16 @@ const fn wire_material_range(range: &MaterialRange) -> v1::MaterialRange {
     v1::MaterialRange { first_triangle: range.first_triangle as u32, material: range.material as u32 }
 }
 
+fn wire_inertia(inertia: &Inertia) -> v1::Inertia {
+    v1::Inertia {
+        mass: inertia.mass(),
+        center: inertia.center().to_vec(),
+        moments: inertia.moments().to_vec(),
+        modal_momenta: inertia.modal_momenta().to_vec(),
+        modal_masses: inertia.modal_masses().to_vec(),
+    }
+}
+
 /// The placement in f64, row-major 3x4. Empty if `placement` is as exact.
 fn exact_placement(domain: &Domain) -> Vec<f64> {
     if domain.placement_remainder == [0.0; 12] {
@@ -500,6 +511,15 @@ mod tests {
         let counts = |max_bytes: usize| take_fitting([30, 30, 30].map(text).into_iter(), max_bytes).len();
         assert_eq!([0, 39, 79, 80, 119, 120, 1000].map(counts), [1, 1, 1, 2, 2, 3, 3]);
         assert_eq!(take_fitting(std::iter::empty::<String>(), 100).len(), 0);
+    }
+
+    #[test]
+    fn wire_inertia_has_every_number_at_its_place() {
+        let (moments, momenta, masses) = ([5.0, 6.0, 7.0, 0.1, 0.2, 0.3], vec![0.01; 12], vec![0.5, 0.1, 0.1, 0.7]);
+        let inertia = Inertia::new(2.0, [0.1, 0.2, 0.3], moments, momenta.clone(), masses.clone());
+        let wire = wire_inertia(&inertia.expect("expected valid masses"));
+        assert_eq!((wire.mass, wire.center, wire.moments), (2.0, vec![0.1, 0.2, 0.3], moments.to_vec()));
+        assert_eq!((wire.modal_momenta, wire.modal_masses), (momenta, masses));
     }
 
     #[test]

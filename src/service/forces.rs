@@ -107,5 +107,6 @@ fn wire_applied_force(applied: &AppliedForce) -> v1::AppliedForce {
         owner: applied.owner,
         force: Some(v1::Force { id: *id, domain: *domain, kind: Some(kind) }),
         f_q: bytemuck::cast_slice(&applied.f_q).to_vec().into(),
+        rest_point: applied.rest_point.map_or(vec![], Into::into),
     }
 }

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use modalcast::engine::{SceneSource, StoredUpload};
 use modalcast_client::{Client, DescriptionRequest, Error, Reason, SceneDescription, ShapeArray};
 use modalcast_model::domain::{
-    AlphaMode, Attachment, Domain, FollowConstraint, Material, MaterialRange, Mesh, Metadata, Modes, Shape, Texture,
-    Transform,
+    AlphaMode, Attachment, Domain, FollowConstraint, Inertia, Material, MaterialRange, Mesh, Metadata, Modes, Shape,
+    Texture, Transform,
 };
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
@@ -56,6 +56,16 @@ fn strip(vertex_count: usize, rank: usize, has_uvs: bool) -> Shape {
     Shape::new(mesh.expect("expected a valid mesh"), modes.expect("expected valid modes")).expect("expected a shape")
 }
 
+/// The mass properties of a shoot with six modes. All numbers differ.
+fn inertia_of_shoot(plant: usize) -> Inertia {
+    let momenta = (0..36).map(|entry| 1e-3 * f64::from(entry)).collect();
+    let mass =
+        |row: i32, column: i32| if row == column { 1.0 + f64::from(row) } else { 0.01 * f64::from(row + column) };
+    let masses = (0..36).map(|entry| mass(entry / 6, entry % 6)).collect();
+    Inertia::new(2.0 + 1e-3 * plant as f64, [0.1, 0.2, 0.3], [5.0, 6.0, 7.0, 0.1, 0.2, 0.3], momenta, masses)
+        .expect("expected valid masses")
+}
+
 /// Plants of four domains: a shoot with six modes, and three rigid leaves that follow it. All shoots have one shape,
 /// and the leaves of a plant have three shapes. Two materials share a texture.
 fn orchard(plant_count: usize) -> Arc<Scene> {
@@ -70,7 +80,9 @@ fn orchard(plant_count: usize) -> Arc<Scene> {
     for plant in 0..plant_count {
         let eigenvalues = (1..7).map(f64::from).collect();
         let placement = Transform([1.0, 0.0, 0.0, plant as f32, 0.0, 1.0, 0.0, 0.5, 0.0, 0.0, 1.0, 0.25]);
-        let metadata = Metadata { eigenvalues, notes: [("kind".into(), "shoot".into())].into() };
+        // The last shoot has no inertia.
+        let inertia = (plant + 1 < plant_count).then(|| inertia_of_shoot(plant));
+        let metadata = Metadata { eigenvalues, inertia, notes: [("kind".into(), "shoot".into())].into() };
         let shoot = domains.len();
         domains.push(Domain { placement, metadata, ..Domain::new(format!("plant {plant}"), 0) });
         for shape in 1..4 {
@@ -143,6 +155,14 @@ fn assert_describes(description: &SceneDescription, scene: &Scene) {
             (&domain.name, domain.shape, domain.material)
         );
         assert_eq!((&described.eigenvalues, &described.notes), (&domain.metadata.eigenvalues, &domain.metadata.notes));
+        let inertia = domain.metadata.inertia.as_ref().map(|inertia| modalcast_client::Inertia {
+            mass: inertia.mass(),
+            center: inertia.center(),
+            moments: inertia.moments(),
+            modal_momenta: inertia.modal_momenta().to_vec(),
+            modal_masses: inertia.modal_masses().to_vec(),
+        });
+        assert_eq!(described.inertia, inertia);
         assert_eq!(described.placement, domain.placement.0);
         let attachment = described.attachment.as_ref().map(|joint| (joint.parent, joint.parent_from_child));
         assert_eq!(attachment, domain.attachment.as_ref().map(|joint| (joint.parent, joint.frame.0)));
@@ -179,8 +199,9 @@ async fn arrays_of_a_shape_are_sent_once_for_all_its_domains() {
     }
     let expected: usize = scene.shapes.iter().flat_map(array_bytes).map(|bytes| bytes.len()).sum();
     assert_eq!(array_bytes_received, expected);
-    // A plant has four domains. A leaf has two transforms of 48 bytes, a name of at most 19 bytes, and indices.
-    assert!(domain_bytes <= 4 * plant_count * 180, "{domain_bytes} bytes of domains");
+    // A plant has four domains. A leaf has two transforms of 48 bytes, a name of at most 19 bytes, and indices. The
+    // inertia of a shoot has 82 numbers.
+    assert!(domain_bytes <= plant_count * (4 * 180 + 82 * 8 + 20), "{domain_bytes} bytes of domains");
     assert!(other_bytes <= 8192, "{other_bytes} bytes of shapes, materials and textures");
 }
 

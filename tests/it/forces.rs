@@ -203,6 +203,16 @@ async fn rotation_of_the_domain_changes_f_q() {
         (rest_set.step.map(|step| step.run), &rest_set.forces[0].f_q),
         (Some(0), &expected_f_q([2.0, 0.0, 0.0]))
     );
+    let scene = strips();
+    let mesh = &scene.shape_of(1).mesh;
+    let corners =
+        mesh.triangles()[0].map(|corner| mesh.rest_positions()[mesh.corners().vertices[corner as usize] as usize]);
+    let component = |axis: usize| {
+        let [a, b, c] = corners.map(|position| f64::from(position[axis]));
+        0.5 * a + 0.25 * b + 0.25 * c
+    };
+    let expected_point = std::array::from_fn(component);
+    assert_eq!(rest_set.forces[0].rest_point, Some(expected_point));
     writer.send_step_and_wait(step(1, &[1], &[0.5, 0.5])).await;
     let pose = [(1, QUARTER_TURN, [0.0, 0.0, 0.0])];
     writer.send_step_and_wait(rigid_step(2, v1::TransformFormat::QuaternionXyzwF32, &pose)).await;

@@ -8,8 +8,9 @@ use std::path::{Path, PathBuf};
 use syn::visit::Visit;
 
 /// Root files of the checked crates.
-const CRATE_ROOTS: [&str; 13] = [
+const CRATE_ROOTS: [&str; 14] = [
     "src/lib.rs",
+    "src/beam/lib.rs",
     "src/model/lib.rs",
     "src/compute/lib.rs",
     "src/render/lib.rs",

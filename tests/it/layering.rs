@@ -47,7 +47,7 @@ fn list_files(folder: &Path, extensions: &[&str]) -> Vec<PathBuf> {
 }
 
 /// Folders of `src` that are crates of their own.
-const CRATE_FOLDERS: [&str; 3] = ["compute", "model", "render"];
+const CRATE_FOLDERS: [&str; 4] = ["beam", "compute", "model", "render"];
 
 /// Crate and top-level module of a file of `src`, named as in the table. `None` for the root file of a crate and for
 /// test support.
@@ -214,8 +214,8 @@ fn module_dependencies_have_no_cycle() {
 #[test]
 fn manifests_have_the_dependencies_of_the_table() {
     let usage_table = read_usage_table();
-    for (folder, package) in
-        [("src/compute", "modalcast-compute"), ("src/render", "modalcast-render"), ("src/model", "modalcast-model")]
+    for (folder, package) in ["src/beam", "src/compute", "src/render", "src/model"]
+        .map(|folder| (folder, folder.replace("src/", "modalcast-")))
     {
         let manifest =
             fs::read_to_string(repository_root().join(folder).join("Cargo.toml")).expect("expected a manifest");
@@ -225,7 +225,7 @@ fn manifests_have_the_dependencies_of_the_table() {
             .map(str::to_owned)
             .collect();
         // The name in a row of the crate table is followed by the folder, as in "`modalcast-render` (`src/render`)".
-        let row = usage_table.iter().find(|(row, _)| row.starts_with(&format!("{package}` (")) || *row == package);
+        let row = usage_table.iter().find(|(row, _)| row.starts_with(&format!("{package}` (")) || **row == package);
         assert_eq!(Some(&dependencies), row.map(|(_, used_modules)| used_modules), "{package}");
     }
 }

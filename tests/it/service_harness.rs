@@ -140,7 +140,7 @@ fn two_strips(mode_scale: f32) -> (Shape, Vec<Domain>) {
     // An attachment and metadata are sent to clients, but do not change the vertices.
     let attachment = Attachment { parent: 0, frame: Transform::IDENTITY, vertices: vec![1, 3] };
     let notes = [("species".to_owned(), "none".to_owned())].into();
-    let metadata = Metadata { eigenvalues: vec![1.0, 4.0], notes };
+    let metadata = Metadata { eigenvalues: vec![1.0, 4.0], inertia: None, notes };
     let left = Domain { metadata, ..domain("left", None) };
     (shape, vec![left, domain("right", Some(attachment))])
 }

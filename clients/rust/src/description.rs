@@ -8,7 +8,9 @@ use modalcast_proto::v1;
 use crate::assemble::{Assembler, Chunk, decode};
 use crate::content::ContentHash;
 use crate::error::{Error, Result, malformed_reply};
-use crate::scene::{Attachment, Domain, Follow, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture};
+use crate::scene::{
+    Attachment, Domain, Follow, Inertia, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture,
+};
 
 /// Identifies an array of a description.
 #[derive(Clone, Copy, PartialEq)]
@@ -126,6 +128,10 @@ impl DescriptionBuilder {
             None => self.shape_eigenvalues[shape].clone(),
         };
         check_eigenvalues(&field("eigenvalues"), &eigenvalues, rank)?;
+        let inertia = match wire.inertia {
+            None => None,
+            Some(inertia) => Some(decode_inertia(&field("inertia"), inertia, rank)?),
+        };
         let rest_q: Vec<f32> = decode("rest_q", &wire.rest_q)?;
         if !rest_q.is_empty() && rest_q.len() != rank {
             return Err(malformed_reply(field("rest_q"), format!("none or {rank} numbers"), rest_q.len()));
@@ -172,6 +178,7 @@ impl DescriptionBuilder {
             rest_q,
             shares_q_with: wire.shares_q_with.map(|owner| owner as usize),
             eigenvalues,
+            inertia,
             name: wire.name,
             notes: wire.notes.into_iter().collect(),
         });
@@ -320,6 +327,23 @@ fn check_eigenvalues(field: &str, eigenvalues: &[f64], rank: usize) -> Result<()
         return Err(malformed_reply(field, format!("no eigenvalues or {rank}"), eigenvalues.len()));
     }
     Ok(())
+}
+
+fn decode_inertia(field: &str, wire: v1::Inertia, rank: usize) -> Result<Inertia> {
+    let v1::Inertia { mass, center, moments, modal_momenta, modal_masses } = wire;
+    let lengths = [("modal_momenta", modal_momenta.len(), 6 * rank), ("modal_masses", modal_masses.len(), rank * rank)];
+    for (name, length, expected) in lengths {
+        if length != expected {
+            return Err(malformed_reply(format!("{field}.{name}"), format!("{expected} numbers"), length));
+        }
+    }
+    Ok(Inertia {
+        mass,
+        center: decode_numbers(format!("{field}.center"), &center)?.unwrap_or_default(),
+        moments: decode_numbers(format!("{field}.moments"), &moments)?.unwrap_or_default(),
+        modal_momenta,
+        modal_masses,
+    })
 }
 
 fn decode_hash(bytes: &[u8]) -> Result<ContentHash> {

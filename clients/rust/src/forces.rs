@@ -112,6 +112,9 @@ pub struct AppliedForce {
     /// The force on the coordinates of the domain: r numbers. For a force f on the surface, it is U^T A^T f, where A is
     /// the linear part of the domain's transform at [`ForceSet::step`].
     pub f_q: Vec<f32>,
+    /// The point of a force on the surface at rest, in scene units and in the domain's own frame. `None` for a force on
+    /// the coordinates.
+    pub rest_point: Option<[f64; 3]>,
 }
 
 /// All forces in a scene.
@@ -198,7 +201,11 @@ fn decode_force(wire: v1::AppliedForce) -> Result<AppliedForce> {
         Some(Kind::Modal(_)) | None => None,
     };
     let f_q = decode("forces.f_q", &wire.f_q)?;
-    Ok(AppliedForce { owner: wire.owner, id: force.id, domain: force.domain, surface, f_q })
+    let rest_point = match (&surface, wire.rest_point.is_empty()) {
+        (None, true) => None,
+        _ => Some(three_numbers("forces.rest_point", &wire.rest_point)?),
+    };
+    Ok(AppliedForce { owner: wire.owner, id: force.id, domain: force.domain, surface, f_q, rest_point })
 }
 
 fn three_numbers(field: &str, numbers: &[f64]) -> Result<[f64; 3]> {
@@ -213,15 +220,22 @@ mod tests {
     fn malformed_forces_report_their_field() {
         let surface = v1::SurfaceForce { triangle: 3, barycentric: vec![0.0, 0.5, 0.5], vector: vec![1.0, 2.0, 3.0] };
         let wire_force = |surface| v1::Force { id: 4, domain: 5, kind: Some(Kind::Surface(surface)) };
-        let valid = v1::AppliedForce { owner: 1, force: Some(wire_force(surface.clone())), f_q: vec![0; 8].into() };
+        let valid = v1::AppliedForce {
+            owner: 1,
+            force: Some(wire_force(surface.clone())),
+            f_q: vec![0; 8].into(),
+            rest_point: vec![0.0, -1.0, 0.5],
+        };
         let force = decode_force(valid.clone()).expect("a valid force");
         let expected_surface = SurfaceForce { triangle: 3, barycentric: [0.0, 0.5, 0.5], vector: [1.0, 2.0, 3.0] };
         assert_eq!((force.id, force.domain, force.surface), (4, 5, Some(expected_surface)));
-        assert_eq!(force.f_q, [0.0, 0.0]);
+        assert_eq!((force.f_q, force.rest_point), (vec![0.0, 0.0], Some([0.0, -1.0, 0.5])));
         let without_vector = v1::SurfaceForce { vector: vec![], ..surface };
         for (wire, field) in [
             (v1::AppliedForce { force: None, ..valid.clone() }, "forces.force"),
             (v1::AppliedForce { f_q: vec![0; 7].into(), ..valid.clone() }, "forces.f_q"),
+            (v1::AppliedForce { rest_point: vec![], ..valid.clone() }, "forces.rest_point"),
+            (v1::AppliedForce { rest_point: vec![0.0; 2], ..valid.clone() }, "forces.rest_point"),
             (v1::AppliedForce { force: Some(wire_force(without_vector)), ..valid }, "forces.surface.vector"),
         ] {
             let error = decode_force(wire).expect_err(field).to_string();

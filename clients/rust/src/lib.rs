@@ -44,7 +44,8 @@ pub use modalcast_proto::v1::{Feature, PROTOCOL_VERSION, SceneInfo, StepId};
 pub use pick::{Hit, PickRectangle, PickRequest, PickResult};
 pub use request::{Delivery, StepRequest, StepSelector, Subscription};
 pub use scene::{
-    AlphaMode, Attachment, Domain, Follow, Material, MaterialRange, SceneDescription, Shape, ShapeArray, Texture,
+    AlphaMode, Attachment, Domain, Follow, Inertia, Material, MaterialRange, SceneDescription, Shape, ShapeArray,
+    Texture,
 };
 pub use stages::{StageSamples, StageTimes};
 pub use states::{

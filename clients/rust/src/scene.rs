@@ -67,8 +67,28 @@ pub struct Domain {
     pub shares_q_with: Option<usize>,
     /// (rad/s)^2, one per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
+    /// Mass properties of the domain's own material; `None` if unknown.
+    pub inertia: Option<Inertia>,
     /// Free-form metadata of the scene's author, by name.
     pub notes: BTreeMap<String, String>,
+}
+
+/// Mass properties of the material of a domain, without the domains that are attached to it. The kinetic energy of a
+/// domain that moves by R X + U q is 1/2 [X', q']^T [[R^T M R, R^T M U], [U^T M R, U^T M U]] [X', q']. X is the small motion of
+/// the domain's frame in its own axes (translation of its origin, then rotation vector), and R are the rigid motions about
+/// the origin.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Inertia {
+    /// kg.
+    pub mass: f64,
+    /// Center of mass at rest, in the frame of the domain and scene units.
+    pub center: [f64; 3],
+    /// Entries xx, yy, zz, xy, xz, yz of the inertia tensor about the frame's origin, kg scene units^2.
+    pub moments: [f64; 6],
+    /// R^T M U, 6 x r row-major.
+    pub modal_momenta: Vec<f64>,
+    /// U^T M U, r x r row-major.
+    pub modal_masses: Vec<f64>,
 }
 
 /// A mesh of n vertices and its r modes. Arrays that were not requested are empty.

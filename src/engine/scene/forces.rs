@@ -118,6 +118,22 @@ impl Force {
         matches!(self.kind, ForceKind::Surface { .. })
     }
 
+    /// The point of a surface force at rest, in scene units and in the frame of the domain. `None` for a modal force.
+    fn rest_point(&self, scene: &Scene) -> Option<[f64; 3]> {
+        let ForceKind::Surface { triangle, barycentrics, .. } = &self.kind else { return None };
+        let shape = scene.shape_of(self.domain as usize);
+        let rest_position = |corner: u32| {
+            let vertex = shape.mesh.corners().vertices[corner as usize];
+            shape.mesh.rest_positions()[vertex as usize]
+        };
+        let corners = shape.mesh.triangles()[*triangle as usize].map(rest_position);
+        let component = |axis: usize| {
+            let terms = corners.iter().zip(barycentrics).map(|(position, weight)| weight * f64::from(position[axis]));
+            shape.origin()[axis] + terms.sum::<f64>()
+        };
+        Some(std::array::from_fn(component))
+    }
+
     /// The force on the coordinates of the domain: U^T A^T f at a point of the surface. A component beyond the range of
     /// f32 is the largest number, so that no reader receives infinity.
     fn reduced(&self, scene: &Scene, state: &SceneState) -> Vec<f32> {
@@ -284,6 +300,7 @@ impl ForceSet {
             owner: number,
             force: force.clone(),
             f_q: force.reduced(scene, state),
+            rest_point: force.rest_point(scene),
         };
         let forces_of = |owned: &'_ OwnedForces| -> Vec<AppliedForce> {
             owned.forces.iter().map(|force| reduce_force(owned.number, force)).collect()
@@ -292,7 +309,7 @@ impl ForceSet {
     }
 }
 
-/// A force and its effect on the coordinates of its domain.
+/// A force, its effect on the coordinates of its domain, and its point.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AppliedForce {
     /// Public number of the owner.
@@ -300,6 +317,8 @@ pub struct AppliedForce {
     pub force: Force,
     /// r numbers.
     pub f_q: Vec<f32>,
+    /// The point of a surface force at rest, in scene units and in the frame of the domain. `None` for a modal force.
+    pub rest_point: Option<[f64; 3]>,
 }
 
 /// The forces of a scene and the notification of their readers.
@@ -404,6 +423,31 @@ mod tests {
         let f_q = force.reduced(&scene, &enlarged);
         assert!(f_q.iter().all(|component| component.is_finite()), "{f_q:?}");
         assert!(f_q.iter().any(|component| component.abs() == f32::MAX), "expected the largest number: {f_q:?}");
+    }
+
+    #[test]
+    fn rest_point_is_interpolated_on_the_triangle() {
+        let scene = testing::two_strips();
+        let force = |barycentrics: &[f64]| {
+            Force::on_surface(&scene, 1, 1, 0, barycentrics, &[1.0, 0.0, 0.0]).expect("expected a valid force")
+        };
+        let corner = |index: usize| {
+            let mut barycentrics = [0.0; 3];
+            barycentrics[index] = 1.0;
+            force(&barycentrics).rest_point(&scene).expect("expected a point")
+        };
+        let shape = scene.shape_of(1);
+        let vertices = shape.mesh.triangles()[0].map(|corner| shape.mesh.corners().vertices[corner as usize]);
+        let positions: Vec<[f64; 3]> = shape.exact_positions().collect();
+        let corners: Vec<[f64; 3]> = (0..3).map(corner).collect();
+        assert_eq!(corners, vertices.map(|vertex| positions[vertex as usize]));
+        assert_ne!(corners[0], corners[1], "control");
+        let point = force(&[0.5, 0.25, 0.25]).rest_point(&scene).expect("expected a point");
+        for axis in 0..3 {
+            let expected = 0.5 * corners[0][axis] + 0.25 * (corners[1][axis] + corners[2][axis]);
+            assert!((point[axis] - expected).abs() <= 1e-12, "expected {expected}, got {point:?}");
+        }
+        assert_eq!(Force { id: 1, domain: 1, kind: ForceKind::Modal(vec![]) }.rest_point(&scene), None);
     }
 
     #[test]

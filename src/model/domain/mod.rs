@@ -5,6 +5,7 @@
 
 mod composed_transform;
 mod creases;
+mod inertia;
 mod jpeg_memory;
 mod material;
 mod mesh;
@@ -17,6 +18,7 @@ mod transform;
 
 pub use composed_transform::ComposedTransform;
 pub use creases::{CreaseAngle, CreasedCorners, split_at_creases};
+pub use inertia::Inertia;
 pub use material::{AlphaMode, Material};
 pub use mesh::{Corners, Mesh, smooth_normals};
 pub use modes::{MAX_RANK, Modes};
@@ -120,6 +122,8 @@ impl Shape {
 pub struct Metadata {
     /// Eigenvalues of the modes, (rad/s)^2, in the order of the columns of U; empty if unknown.
     pub eigenvalues: Vec<f64>,
+    /// Mass properties of the domain's own material, without the domains that are attached to it; `None` if unknown.
+    pub inertia: Option<Inertia>,
     /// Other values by name.
     pub notes: BTreeMap<String, String>,
 }

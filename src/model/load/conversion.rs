@@ -126,9 +126,22 @@ fn shell_word(name: &str) -> String {
     shlex::try_quote(&name).map_or_else(|_| name.clone(), Into::into)
 }
 
-/// How a model of another format is converted, in parentheses after a space. Empty for an unknown format.
+/// Extensions of files with volume meshes, from which `modalcast model` computes modes. `.vtk`, `.vtu` and `.msh` files can
+/// also contain surfaces.
+const VOLUME_MESHES: [&str; 4] = ["msh", "vtk", "vtu", "veg"];
+
+/// Whether a file has the extension of a volume mesh, from which `modalcast model` computes modes.
+pub fn is_volume_mesh(name: &str) -> bool {
+    VOLUME_MESHES.contains(&extension_of(name).as_str())
+}
+
+/// How a model of another format is used, in parentheses after a space. Empty for an unknown format.
 pub(super) fn model_hint(name: &str) -> String {
-    hint(MODELS, name)
+    let model = match is_volume_mesh(name) {
+        true => format!(" (`modalcast model {}` computes the modes of a volume mesh)", shell_word(name)),
+        false => String::new(),
+    };
+    model + &hint(MODELS, name)
 }
 
 /// How a compressed glTF file becomes one that is read, as for [`model_hint`].
@@ -175,5 +188,11 @@ mod tests {
             " (convert it in its folder with `assimp export ./-a.dae ./-a.glb` after `pip install cmeel-assimp`)"
         );
         assert_eq!([model_hint("a.obj"), modes_hint("a.vtk"), model_hint("vtk")], [""; 3]);
+        assert_eq!(model_hint("a.veg"), " (`modalcast model a.veg` computes the modes of a volume mesh)");
+        let hint = model_hint("a b.VTU");
+        assert!(
+            hint.starts_with(" (`modalcast model 'a b.VTU'` computes the modes of a volume mesh) (convert"),
+            "{hint}"
+        );
     }
 }

@@ -4,6 +4,8 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use nalgebra::{Matrix3, Vector3};
+
 use crate::domain::AlphaMode;
 use crate::scene::{Scene, UpAxis};
 
@@ -116,7 +118,7 @@ fn real_almond_has_1447_domains_and_all_faces() {
     assert_eq!(scene.up, UpAxis::Z);
     let height = scene.rest_bounds.max[2] - scene.rest_bounds.min[2];
     assert!((height - 2.6745).abs() < 1e-3, "{height}");
-    assert!(scene.features.mask && !scene.features.modes && !scene.features.normal_maps);
+    assert!(scene.features.mask && scene.features.modes && !scene.features.normal_maps);
     assert_eq!(
         open_scene("plants/almond/almond.obj").domains.len(),
         1447,
@@ -161,6 +163,75 @@ fn real_plants_have_the_bounds_of_their_file_and_compact_leaves() {
                 domain.name
             );
         }
+    }
+}
+
+/// The motion of a joint per unit of a mode, fitted to the attachment vertices: displacement at `point`, and rotation.
+fn fitted_joint_motion(
+    shape: &crate::domain::Shape,
+    vertices: &[u32],
+    point: &Vector3<f64>,
+    mode: usize,
+) -> [Vector3<f64>; 2] {
+    let place = |vertex: &u32| Vector3::from(shape.mesh.rest_positions()[*vertex as usize]).cast::<f64>();
+    let displacement =
+        |vertex: &u32| Vector3::from_fn(|axis, _| f64::from(shape.modes.entry(*vertex as usize, axis, mode)));
+    let count = vertices.len() as f64;
+    let center = vertices.iter().map(place).sum::<Vector3<f64>>() / count;
+    let mean = vertices.iter().map(displacement).sum::<Vector3<f64>>() / count;
+    let arms = || vertices.iter().map(|vertex| (place(vertex) - center, displacement(vertex)));
+    let spread: Matrix3<f64> =
+        arms().map(|(arm, _)| Matrix3::identity() * arm.norm_squared() - arm * arm.transpose()).sum();
+    let moment: Vector3<f64> = arms().map(|(arm, displacement)| arm.cross(&displacement)).sum();
+    let rotation = spread.try_inverse().expect("vertices that are not collinear") * moment;
+    [mean + rotation.cross(&(point - center)), rotation]
+}
+
+#[test]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../../../shared/data (from this crate)"]
+fn real_plants_are_flexible_and_their_joints_move_rigidly() {
+    for (name, min_coordinates) in [("almond", 4500), ("bean", 690)] {
+        let start = std::time::Instant::now();
+        let scene = open_scene(&format!("plants/{name}"));
+        let coordinates: usize = (0..scene.domains.len()).map(|domain| scene.rank_of(domain)).sum();
+        println!("{name}: {coordinates} coordinates, {:.2} s, {:?}", start.elapsed().as_secs_f64(), scene.remarks);
+        assert!(coordinates >= min_coordinates, "{name}: {coordinates}");
+        let mut largest_residual = 0.0_f64;
+        let mut lowest: std::collections::BTreeMap<(usize, String), f64> = std::collections::BTreeMap::new();
+        let mut levels = vec![0; scene.domains.len()];
+        for (index, domain) in scene.domains.iter().enumerate() {
+            let shape = scene.shape_of(index);
+            let eigenvalues = &domain.metadata.eigenvalues;
+            assert!(shape.modes.columns().iter().all(|entry| entry.is_finite()));
+            assert!(scene.rank_of(index) >= 3 && eigenvalues.len() == scene.rank_of(index), "{}", domain.name);
+            assert!(eigenvalues.iter().all(|eigenvalue| eigenvalue.is_finite() && *eigenvalue > 0.0));
+            if let Some(attachment) = &domain.attachment {
+                levels[index] = levels[attachment.parent] + 1;
+                let parent = scene.shape_of(attachment.parent);
+                let vertices = &attachment.vertices;
+                assert!(vertices.len() >= 3, "{}", domain.name);
+                for mode in 0..parent.modes.rank() {
+                    let point = attachment.frame.translation();
+                    let [translation, rotation] = fitted_joint_motion(parent, vertices, &point, mode);
+                    let scale = (0..parent.modes.vertices())
+                        .map(|vertex| Vector3::from_fn(|axis, _| parent.modes.entry(vertex, axis, mode)).norm())
+                        .fold(0.0, f32::max);
+                    for vertex in vertices {
+                        let place = Vector3::from(parent.mesh.rest_positions()[*vertex as usize]).cast::<f64>();
+                        let expected = translation + rotation.cross(&(place - point));
+                        let actual =
+                            Vector3::from_fn(|axis, _| f64::from(parent.modes.entry(*vertex as usize, axis, mode)));
+                        largest_residual = largest_residual.max((actual - expected).norm() / f64::from(scale));
+                    }
+                }
+            }
+            let kind = domain.metadata.notes["plant.kind"].clone();
+            let hertz = eigenvalues[0].sqrt() / std::f64::consts::TAU;
+            let entry = lowest.entry((levels[index], kind)).or_insert(f64::INFINITY);
+            *entry = entry.min(hertz);
+        }
+        println!("{name}: residual of the attachment vertices {largest_residual:.1e}, lowest frequencies {lowest:.2?}");
+        assert!(largest_residual < 1e-5, "{name}: {largest_residual}");
     }
 }
 

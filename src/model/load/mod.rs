@@ -44,6 +44,7 @@ mod modes;
 mod npz_model;
 mod obj;
 mod plant;
+mod plant_materials;
 mod ply;
 mod polygons;
 mod repository;
@@ -56,6 +57,7 @@ mod texture_cache;
 mod values;
 mod vega_config;
 
+pub use conversion::is_volume_mesh;
 pub use file_hashes::FileHashes;
 pub use modes::{NpyArray, parse_numpy};
 pub use repository::SceneRepository;

@@ -67,8 +67,17 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
         let notes = model.notes.clone();
         // The notes on the files beside the archive win.
         domain.metadata.notes = notes.into_iter().chain(std::mem::take(&mut domain.metadata.notes)).collect();
+        remove_foreign_forces(&mut domain.metadata.notes);
     }
     Ok(parts)
+}
+
+/// Removes the note on cubic forces beside a model whose modes `modalcast model` computed without such forces: they belong
+/// to other modes.
+fn remove_foreign_forces(notes: &mut BTreeMap<String, String>) {
+    if notes.contains_key("modes.source") && !notes.contains_key("modes.cubic_sha256") {
+        notes.remove("vega.cubic");
+    }
 }
 
 fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<ParsedModel> {
@@ -465,6 +474,23 @@ mod tests {
         let note = |name: &str, text: &str| (name.to_owned(), text.to_owned());
         assert_eq!(notes, [note("modes.file", "a.npz"), note("modes.material", "steel, 7850 kg/m\u{b3}")]);
         assert_eq!(parts.remarks, [""; 0]);
+    }
+
+    #[test]
+    fn forces_beside_the_archive_are_named_unless_they_belong_to_other_modes() {
+        let named = |notes: &str| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let u = npy(&ndarray::Array3::from_elem((4, 3, 1), 1.0_f32));
+            let arrays = [square(), vec![("notes", npy(&arr1(notes.as_bytes()))), ("U", u)]].concat();
+            std::fs::write(folder.path().join("a.npz"), archive(&arrays, zip::CompressionMethod::Stored))
+                .expect("a writable file");
+            std::fs::write(folder.path().join("a.cub"), "").expect("a writable file");
+            let parts = read(&AssetDir::unrestricted(folder.path()), "a.npz", ModelOptions::default());
+            parts.expect("a valid archive").domains[0].metadata.notes.get("vega.cubic").cloned()
+        };
+        assert_eq!(named("{}"), Some("a.cub".into()));
+        assert_eq!(named(r#"{"modes.source": "a.msh", "modes.cubic_sha256": "00"}"#), Some("a.cub".into()));
+        assert_eq!(named(r#"{"modes.source": "a.msh"}"#), None);
     }
 
     #[test]

@@ -132,7 +132,7 @@ fn read_model_file(folder: &AssetDir, model: &ModelFile, options: ModelOptions) 
     let mut parts = match model {
         ModelFile::Gltf(name) => gltf::read(folder, name, options.crease_angle),
         ModelFile::Obj(name) => obj::read(folder, name, options),
-        ModelFile::Plant(name) => plant::read(folder, name, options.crease_angle),
+        ModelFile::Plant(name) => plant::read(folder, name, options),
         ModelFile::Ply(name) => ply::read(folder, name, options),
         ModelFile::Stl(name) => stl::read(folder, name, options),
         ModelFile::Npz(name) => npz_model::read(folder, name, options),

@@ -2,6 +2,7 @@
 
 use super::asset_dir::AssetDir;
 use super::modes::{self, LoadedModes};
+use super::plant_materials::PlantMaterials;
 use super::polygons::{self, PolygonMesh, VertexColors};
 use crate::domain::{CreaseAngle, Domain, Material, Mesh, Metadata, Modes, Shape};
 use crate::error::{Error, Result};
@@ -23,6 +24,8 @@ pub(super) struct ModelOptions {
     pub(super) modes: ModesSource,
     /// For the normals that the file does not contain.
     pub(super) crease_angle: CreaseAngle,
+    /// Elastic constants of plants.
+    pub(super) plant: PlantMaterials,
 }
 
 #[cfg(test)]
@@ -74,7 +77,7 @@ pub(super) fn add_domain(
     parts.domains.push(Domain {
         material: triangles.material,
         material_ranges: triangles.material_ranges,
-        metadata: Metadata { eigenvalues: loaded.eigenvalues, notes },
+        metadata: Metadata { eigenvalues: loaded.eigenvalues, inertia: None, notes },
         ..Domain::new(parts.name.clone(), 0)
     });
     Ok(())

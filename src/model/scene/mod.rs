@@ -338,6 +338,9 @@ fn check_domain(parts: &SceneParts, index: usize) -> Result<()> {
     if let Some(number) = exact_numbers.find(|number| !number.is_finite()) {
         return Err(invalid("placement", "finite numbers", number));
     }
+    if let Some(inertia) = domain.metadata.inertia.as_ref().filter(|inertia| inertia.rank() != rank) {
+        return Err(invalid("inertia", format!("{rank} modes, as the shape has"), inertia.rank()));
+    }
     if !domain.rest_q.is_empty() && domain.rest_q.len() != rank {
         return Err(invalid("rest_q", format!("none or {rank} coordinates"), domain.rest_q.len()));
     }

@@ -1,27 +1,25 @@
 //! The built-in scene `tree`, generated from a seed.
 //!
-//! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every
-//! wooden part is a clamped Euler-Bernoulli beam along its centerline, loaded with the masses of its children as point
-//! masses at their joints. The modes of the beam are lifted to the part's skin, its surface mesh. The skin consists of
-//! rings: each ring is the circle of vertices around one point of the centerline. Modes are mass-orthonormal: U^T M U =
-//! I with M in kg. U is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons.
+//! A trunk of 6.8 m carries boughs and twigs, boughs carry twigs, and boughs and twigs carry leaf clusters. Every part is
+//! a clamped beam along its centerline ([`modalcast_beam`]). The modes of the beam are lifted to the part's skin, its
+//! surface mesh. The skin consists of rings: each ring is the circle of vertices around one point of the centerline.
+//!
+//! The modes are loaded-interface modes: at each joint, the beam carries the rigid inertia D_c of everything beyond it.
+//! They are normalized to U^T (M + sum P_c^T D_c P_c) U = I with the own mass M in kg and the motions P_c of the joints. U
+//! is in 1/sqrt(kg) and q in m sqrt(kg), so that the modal forces are U^T f with f in newtons. Instances of a template
+//! carry the same parts, and share their modes. Only the roll of a part about its own axis differs between instances of
+//! its parent, because parts turn towards the light. D_c has the roll of the template's up direction.
 //!
 //! The coordinate frame of a part has its origin at the center of the part's base, +Y along the start of the
 //! centerline, and +Z as close to the world's up direction as possible.
 
-mod band;
 mod bark;
-mod beam;
 mod centerline;
 mod cluster;
-mod element;
-#[cfg(test)]
-mod frame_model;
 mod leaf_image;
 mod noise;
 mod random;
 mod skin;
-mod skin_modes;
 mod species;
 mod template;
 
@@ -87,7 +85,7 @@ pub fn generate(parameters: &TreeParameters) -> Result<SceneParts> {
         ..RenderSettings::default()
     };
     add_materials(&mut parts, &mut random.fork())?;
-    let templates = species::grow_templates(&mut random.fork());
+    let templates = species::grow_templates(&mut random.fork())?;
     let shapes_and_metadata = templates.par_iter().map(PartTemplate::build_shape).collect::<Result<Vec<_>>>()?;
     let (shapes, metadata): (Vec<_>, Vec<_>) = shapes_and_metadata.into_iter().unzip();
     parts.shapes = shapes;

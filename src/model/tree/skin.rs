@@ -1,10 +1,10 @@
 //! Builder of a part's skin: tubes around centerlines, and leaf blades. Every vertex has a station: the position along
 //! the beam whose section moves the vertex.
 
-use nalgebra::Vector3;
+use modalcast_beam::{RigidInertia, Station};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 
 use super::centerline::Centerline;
-use super::skin_modes::Station;
 use crate::domain::{Corners, Mesh, smooth_normals};
 use crate::error::Result;
 
@@ -63,6 +63,19 @@ const BLADE_ROWS: usize = 2;
 
 /// The bark texture scales with the radius of a branch, but not below this radius (meters).
 const MIN_TEXTURE_RADIUS: f64 = 0.012;
+
+impl Blade {
+    /// The inertia of the blade with `mass` in kg about `point`: a flat rectangle. The curl and the fold are neglected.
+    pub(super) fn inertia(&self, mass: f64, point: &Vector3<f64>) -> RigidInertia {
+        let right = self.forward.cross(&self.normal);
+        let square = |vector: Vector3<f64>, side: f64| vector * vector.transpose() * (side * side / 12.0);
+        // The second moments of the mass about its center, in three directions.
+        let spread = square(right, self.width) + square(self.forward, self.length);
+        let tensor = (Matrix3::identity() * spread.trace() - spread) * mass;
+        let center = self.base + self.forward * (0.5 * self.length) - point;
+        RigidInertia::body(mass, Vector3::zeros(), tensor).seen_from(&Rotation3::identity(), &center)
+    }
+}
 
 impl SkinBuilder {
     /// Builds the mesh, with smooth normals.
@@ -280,6 +293,33 @@ mod tests {
         assert!((end_station.element, end_station.fraction) == (11, 1.0));
         assert!((position - centerline.points[12]).norm() < 1e-12);
         assert!((tangent - centerline.tangents[12]).norm() < 1e-12);
+    }
+
+    #[test]
+    fn inertia_of_a_blade_is_that_of_its_points() {
+        let orientation = Rotation3::from_euler_angles(0.3, 0.7, -0.2);
+        let blade = Blade {
+            base: Vector3::new(0.1, 0.2, -0.3),
+            forward: orientation * Vector3::y(),
+            normal: orientation * Vector3::z(),
+            length: 0.2,
+            width: 0.1,
+            curl: 0.0,
+            fold: 0.0,
+            u_range: [0.0, 1.0],
+        };
+        let point = Vector3::new(0.05, 0.0, 0.1);
+        let count = 100;
+        let masses = (0..count * count).map(|index| {
+            let [row, column] = [index / count, index % count].map(|index| (f64::from(index) + 0.5) / f64::from(count));
+            let local = Vector3::new(blade.width * (column - 0.5), blade.length * row, 0.0);
+            let place = blade.base + orientation * local - point;
+            let mass = RigidInertia::point_mass(2.0 / f64::from(count * count));
+            mass.seen_from(&Rotation3::identity(), &place)
+        });
+        let expected = masses.sum::<RigidInertia>();
+        let difference = blade.inertia(2.0, &point).matrix() - expected.matrix();
+        assert!(difference.norm() < 1e-4 * expected.tensor().norm(), "{difference}");
     }
 
     #[test]

@@ -3,14 +3,15 @@
 
 use std::f64::consts::TAU;
 
+use modalcast_beam::ElasticConstants;
 use nalgebra::{Rotation3, Unit, Vector3};
 
 use super::centerline::{Centerline, GrowthParameters, part_orientation};
 use super::cluster::leaf_clusters;
-use super::element::ElasticConstants;
 use super::random::SplitMix64;
 use super::skin::{SkinBuilder, UvMapping};
 use super::template::{ChildJoint, PartKind, PartTemplate};
+use crate::error::Result;
 
 /// Green wood.
 const WOOD: ElasticConstants = ElasticConstants { youngs_modulus: 4.5e9, shear_modulus: 3.5e8, density: 900.0 };
@@ -28,11 +29,14 @@ const CROWN_RANGE: [f64; 2] = [0.24, 0.96];
 const TWIG_LENGTHS: [f64; 12] = [0.45, 0.50, 0.56, 0.66, 0.72, 0.78, 0.90, 0.97, 1.04, 1.18, 1.26, 1.34];
 
 /// Generates the templates of a tree: children before parents, the trunk last.
-pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
+///
+/// # Errors
+/// `Fault` if a part has no valid beam.
+pub(super) fn grow_templates(random: &mut SplitMix64) -> Result<Vec<PartTemplate>> {
     let mut templates = leaf_clusters(&mut random.fork());
     let leaf_range = 0..templates.len();
     for length in TWIG_LENGTHS {
-        let twig = grow_twig(length, &templates[leaf_range.clone()], &mut random.fork());
+        let twig = grow_twig(length, &templates[leaf_range.clone()], &mut random.fork())?;
         templates.push(twig);
     }
     let twig_range = leaf_range.end..templates.len();
@@ -47,8 +51,8 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
             &templates,
             &[leaf_range.clone(), twig_range.clone()],
             &mut random,
-        );
-        trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, bough.mass());
+        )?;
+        trunk.attach_child(ChildJoint { ring, direction, template_index: templates.len() }, &bough)?;
         templates.push(bough);
     }
     // Twigs of medium length (twig templates 4 to 8) form the top of the crown. Each pair is a ring and the angle
@@ -58,10 +62,10 @@ pub(super) fn grow_templates(random: &mut SplitMix64) -> Vec<PartTemplate> {
         let side = perpendicular_at(&trunk.centerline, ring, GOLDEN_ANGLE * (ring + BOUGH_COUNT) as f64);
         let direction = trunk.centerline.branch_direction(ring, angle, &side);
         let template_index = twig_range.start + 4 + ring % 5;
-        trunk.attach_child(ChildJoint { ring, direction, template_index }, templates[template_index].mass());
+        trunk.attach_child(ChildJoint { ring, direction, template_index }, &templates[template_index])?;
     }
     templates.push(trunk);
-    templates
+    Ok(templates)
 }
 
 fn grow_trunk(random: &mut SplitMix64) -> PartTemplate {
@@ -120,7 +124,7 @@ fn grow_bough(
     templates: &[PartTemplate],
     [leaf_range, twig_range]: &[std::ops::Range<usize>; 2],
     random: &mut SplitMix64,
-) -> PartTemplate {
+) -> Result<PartTemplate> {
     let growth = GrowthParameters {
         length,
         segments: 12,
@@ -139,6 +143,7 @@ fn grow_bough(
     let mut template = wooden_part(PartKind::Branch, centerline, radii, [sides, rank]);
     template.level = Some(1);
     template.damping = 0.07;
+    template.up = growth.up;
     template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
     let twig_count = (length / 0.42).round().max(3.0) as usize;
     for index in 0..twig_count {
@@ -148,14 +153,14 @@ fn grow_bough(
         let side = side_direction(&template.centerline, ring, &growth.up, index, random);
         let direction = template.centerline.branch_direction(ring, random.uniform(0.70, 1.0) - 0.2 * fraction, &side);
         let template_index = choose_twig(twig_length, twig_range, random);
-        template.attach_child(ChildJoint { ring, direction, template_index }, templates[template_index].mass());
+        template.attach_child(ChildJoint { ring, direction, template_index }, &templates[template_index])?;
     }
-    attach_leaf_clusters(&mut template, &[0.50, 0.66, 0.82, 1.0], &templates[leaf_range.clone()], &growth.up, random);
-    template
+    attach_leaf_clusters(&mut template, &[0.50, 0.66, 0.82, 1.0], &templates[leaf_range.clone()], &growth.up, random)?;
+    Ok(template)
 }
 
 /// Grows a twig with its leaf clusters.
-fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> PartTemplate {
+fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> Result<PartTemplate> {
     let growth = GrowthParameters {
         length,
         segments: 10,
@@ -173,12 +178,13 @@ fn grow_twig(length: f64, leaves: &[PartTemplate], random: &mut SplitMix64) -> P
     let mut template = wooden_part(PartKind::Branch, centerline, radii, [sides, rank]);
     template.level = Some(2);
     template.damping = 0.09;
+    template.up = growth.up;
     template.add_skin(UvMapping::Bark { repeats: 1 }, |_, _| 1.0);
     let interval_count = (0.6 + length / 0.33).round() as usize;
     let fractions: Vec<f64> =
         (0..=interval_count).map(|index| 0.24 + 0.76 * index as f64 / interval_count as f64).collect();
-    attach_leaf_clusters(&mut template, &fractions, leaves, &growth.up, random);
-    template
+    attach_leaf_clusters(&mut template, &fractions, leaves, &growth.up, random)?;
+    Ok(template)
 }
 
 /// Attaches leaf clusters at fractions of the length. A cluster at the tip continues the branch. `leaves` is the start
@@ -189,7 +195,7 @@ fn attach_leaf_clusters(
     leaves: &[PartTemplate],
     up: &Vector3<f64>,
     random: &mut SplitMix64,
-) {
+) -> Result<()> {
     for (index, fraction) in fractions.iter().enumerate() {
         let ring = template.centerline.ring_at(*fraction);
         let is_tip = ring + 1 == template.centerline.points.len();
@@ -197,8 +203,9 @@ fn attach_leaf_clusters(
         let angle = if is_tip { random.uniform(0.0, 0.2) } else { random.uniform(0.65, 1.05) };
         let direction = template.centerline.branch_direction(ring, angle, &side);
         let template_index = (random.next_unit() * leaves.len() as f64) as usize;
-        template.attach_child(ChildJoint { ring, direction, template_index }, leaves[template_index].mass());
+        template.attach_child(ChildJoint { ring, direction, template_index }, &leaves[template_index])?;
     }
+    Ok(())
 }
 
 /// A part of wood with `sides` vertices per ring and `rank` modes. It has level 0, and no skin, children or damping
@@ -213,7 +220,9 @@ fn wooden_part(kind: PartKind, centerline: Centerline, radii: Vec<f64>, [sides, 
         skin: SkinBuilder::default(),
         elastic: WOOD,
         damping: 0.0,
-        point_masses: vec![],
+        own_bodies: vec![],
+        carried_bodies: vec![],
+        up: Vector3::y(),
         children: vec![],
         rank,
         leaf_area: 0.0,

@@ -83,12 +83,14 @@ class AppliedForce:
         domain: Index of the domain.
         f_q: The force on the domain's coordinates, r numbers.
         vector: The force in newtons, in world axes; None for a modal force.
+        rest_point: The point of the force at rest, in scene units and the frame of the domain; None for a modal force.
     """
 
     owner: int
     domain: int
     f_q: F32
     vector: F64 | None
+    rest_point: F64 | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +112,8 @@ def force_set(message: forces_pb2.StreamForcesResponse) -> ForceSet:
     def applied(force: forces_pb2.AppliedForce) -> AppliedForce:
         surface = force.force.HasField("surface")
         vector = np.array(force.force.surface.vector) if surface else None
-        return AppliedForce(force.owner, force.force.domain, np.frombuffer(force.f_q, "<f4"), vector)
+        rest_point = np.array(force.rest_point) if surface else None
+        return AppliedForce(force.owner, force.force.domain, np.frombuffer(force.f_q, "<f4"), vector, rest_point)
 
     step = step_id(message.step) if message.HasField("step") else None
     return ForceSet(step, tuple(applied(force) for force in message.forces))

@@ -170,7 +170,11 @@ impl ManifestAssembler<'_> {
         crease_angle: CreaseAngle,
     ) -> Result<LoadedModel> {
         let modes = if entry.modes.is_some() { ModesSource::None } else { ModesSource::Sidecar };
-        let mut model = source::read_model(self.files, &entry.model, ModelOptions { modes, crease_angle })?;
+        let mut model = source::read_model(
+            self.files,
+            &entry.model,
+            ModelOptions { modes, crease_angle, plant: self.manifest.plant },
+        )?;
         if let Some(file) = &entry.modes {
             replace_modes(self.files, file, &mut model)?;
         }
@@ -396,8 +400,8 @@ fn add_follow_constraints(entry: &DomainEntry, domains: &mut [Domain]) -> Result
     }
 }
 
-/// Replaces U and the eigenvalues of a model with one shape, and clears the rest coordinates, which belong to the old
-/// modes.
+/// Replaces U and the eigenvalues of a model with one shape, and clears the inertia and the rest coordinates, which belong
+/// to the old modes.
 fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result<()> {
     let [shape] = &mut model.shapes[..] else {
         return Err(invalid("modes", "a model with one shape", format!("{} shapes", model.shapes.len())));
@@ -409,6 +413,7 @@ fn replace_modes(files: &AssetDir, file: &str, model: &mut SceneParts) -> Result
     for domain in &mut model.domains {
         domain.rest_q.clear();
         domain.metadata.eigenvalues.clone_from(&loaded.eigenvalues);
+        domain.metadata.inertia = None;
         if !file.is_empty() {
             domain.metadata.notes.insert(modes::FILE_NOTE.to_owned(), file.to_owned());
         }

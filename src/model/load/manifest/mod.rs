@@ -15,6 +15,7 @@ use placement::Placement;
 use settings::{DeformKeys, LookKeys};
 
 use super::asset_dir::AssetDir;
+use super::plant_materials::PlantMaterials;
 use super::{LoadOptions, SceneDescription};
 use crate::error::{Result, invalid};
 use crate::scene::{LengthUnit, UpAxis};
@@ -46,6 +47,9 @@ struct Manifest {
     material: BTreeMap<String, MaterialPatch>,
     /// In degrees, of all entries without a crease angle.
     crease_angle: Option<f64>,
+    /// Elastic constants of all plants.
+    #[serde(default)]
+    plant: PlantMaterials,
     model: Option<String>,
     modes: Option<String>,
     follows: Option<String>,
@@ -113,6 +117,7 @@ pub(super) fn read(
     if let Some(lighting) = options.lighting {
         manifest.look.get_or_insert_default().lighting = Some(lighting);
     }
+    manifest.plant.check().map_err(|error| error.prefix_field(&location))?;
     let entries = take_entries(&mut manifest).map_err(|error| error.prefix_field(&location))?;
     let files = if manifest.strict { &files.strict() } else { files };
     assemble::assemble(files, &manifest, &entries, default_name).map_err(|error| error.prefix_field(&location))

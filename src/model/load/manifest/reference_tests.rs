@@ -80,6 +80,7 @@ fn page_has_exactly_the_keys_of_the_parser() {
         "look.edges",
         "look.bloom",
         "deform",
+        "plant",
     ];
     for heading in headings {
         let rows = tables.get(heading).unwrap_or_else(|| panic!("expected a table of {heading}"));

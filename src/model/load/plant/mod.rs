@@ -1,22 +1,42 @@
-//! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`). Each shoot and each leaf becomes a rigid
-//! domain. Lengths are in meters, Z is up. Steps can move every domain independently. A `scene.toml` with
-//! `follows = "leaf"` makes leaves move with their shoots instead.
+//! Loader of plants (`STEM.obj`, `STEM.structure.json`, `STEM_object_id.dat`). Each shoot and each leaf becomes a domain.
+//! Lengths are in meters, Z is up. Steps can move every domain independently. A `scene.toml` with `follows = "leaf"` makes
+//! leaves move with their shoots instead.
+//!
+//! A shoot with radii is a beam along its polyline, and a leaf a beam along its petiole and its blade. Their modes are
+//! loaded-interface modes (crate `modalcast-beam`). The rest shape is the equilibrium under the weight, so gravity is no
+//! load. Other objects, such as fruits, move rigidly with the nearest section of their shoot. Shoots without radii are
+//! rigid. If no shoot has radii, all organs are rigid.
 
+mod blade;
+#[cfg(test)]
+mod flexible_tests;
+mod organ_beams;
+mod organ_modes;
 mod organs;
+mod skin;
 mod structure;
 
 use std::collections::{BTreeMap, HashMap};
 
-use nalgebra::Matrix4;
+use nalgebra::{Matrix4, Vector3};
+use organ_beams::{LeafGeometry, OrganBeam, solid_inertia};
+use organ_modes::{FlexibleBody, OrganBody, OrganKind, add_modes};
 use organs::{Organ, assign_organs};
+use skin::Skin;
 use structure::{PlantStructure, parse_object_ids};
 
 use super::asset_dir::{AssetDir, MAX_TEXT_BYTES, stem_of};
 use super::obj;
+use super::plant_materials::PlantMaterials;
 use super::polygons::{self, PolygonMesh};
+use super::surface::{ModelOptions, ModesSource};
 use crate::domain::{Attachment, CreaseAngle, Domain, Metadata, Modes, Shape, Transform};
 use crate::error::Result;
 use crate::scene::{SceneParts, UpAxis};
+
+/// Most points of the polyline of a flexible organ. The time for an organ goes as its points times the vertices of its
+/// mesh.
+const MAX_BEAM_POINTS: usize = 4096;
 
 /// Reads the plant whose OBJ file is `name` in the folder `files`.
 ///
@@ -25,7 +45,7 @@ use crate::scene::{SceneParts, UpAxis};
 ///
 /// # Errors
 /// `Invalid` with the file, and the expected and given value.
-pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> Result<SceneParts> {
+pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let stem = stem_of(name);
     let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
     let file_field = |name: &str| format!("file '{name}'");
@@ -46,15 +66,27 @@ pub(super) fn read(files: &AssetDir, name: &str, crease_angle: CreaseAngle) -> R
             faces_by_organ.entry(*organ).or_default().push(face);
         }
     }
-    PlantBuilder {
+    let builder = PlantBuilder {
         polygons: &obj.polygons,
         structure: &structure,
+        object_ids: &object_ids,
+        object_of_vertex: objects_of_vertices(&obj.polygons, &object_ids),
         faces_by_organ,
         organ_domains: HashMap::new(),
+        bodies: Vec::new(),
         parts,
-        crease_angle,
+        crease_angle: options.crease_angle,
+        materials: options.plant,
+    };
+    let (mut parts, bodies) = builder.build()?;
+    if options.modes != ModesSource::None {
+        if structure.shoots.iter().any(|shoot| shoot.radii.is_some()) {
+            add_modes(bodies, &options.plant, files, &mut parts)?;
+        } else {
+            parts.remarks.push("the structure has no radii: all organs are rigid".into());
+        }
     }
-    .build()
+    Ok(parts)
 }
 
 /// For each object id, the positions of the corners of its faces.
@@ -67,20 +99,45 @@ fn positions_by_object(polygons: &PolygonMesh, object_ids: &[u64]) -> BTreeMap<u
     positions
 }
 
+/// The object of each vertex of the file; 0 for a vertex without faces, which no mesh has.
+fn objects_of_vertices(polygons: &PolygonMesh, object_ids: &[u64]) -> Vec<u64> {
+    let mut objects = vec![0; polygons.positions.len()];
+    for (face, object_id) in object_ids.iter().enumerate() {
+        polygons.corners_of(face).iter().for_each(|corner| objects[corner.vertex as usize] = *object_id);
+    }
+    objects
+}
+
 struct PlantBuilder<'a> {
     polygons: &'a PolygonMesh,
     structure: &'a PlantStructure,
+    /// The object of each face.
+    object_ids: &'a [u64],
+    /// The object of each vertex of the file.
+    object_of_vertex: Vec<u64>,
     faces_by_organ: HashMap<Organ, Vec<usize>>,
     /// Index and origin of the domain of each organ so far.
     organ_domains: HashMap<Organ, (usize, [f64; 3])>,
+    /// One per domain.
+    bodies: Vec<OrganBody>,
     parts: SceneParts,
     crease_angle: CreaseAngle,
+    materials: PlantMaterials,
+}
+
+/// The mesh of an organ, relative to the origin of its domain.
+struct OrganMesh<'a> {
+    faces: &'a [usize],
+    origin: Vector3<f64>,
+    positions: &'a [[f32; 3]],
+    /// The vertex of the file for each vertex.
+    file_vertices: &'a [u32],
 }
 
 impl PlantBuilder<'_> {
     /// Adds the shoots, parents first, then the leaves with a petiole polyline, then the leaves without one. The parent
     /// of a leaf without a polyline is the leaf with the polyline of the same petiole or, if there is none, the shoot.
-    fn build(mut self) -> Result<SceneParts> {
+    fn build(mut self) -> Result<(SceneParts, Vec<OrganBody>)> {
         let structure = self.structure;
         for index in &structure.parent_first_order {
             let shoot = &structure.shoots[*index];
@@ -101,7 +158,7 @@ impl PlantBuilder<'_> {
                 self.add_domain(Organ::Leaf(index), format!("leaf {}", leaf.object_id), leaf.base, parent)?;
             }
         }
-        Ok(self.parts)
+        Ok((self.parts, self.bodies))
     }
 
     fn add_domain(&mut self, organ: Organ, name: String, origin: [f64; 3], parent: Option<Organ>) -> Result<()> {
@@ -109,25 +166,116 @@ impl PlantBuilder<'_> {
         let triangle_mesh = polygons::build_faces(self.polygons, &faces, origin, self.crease_angle)
             .map_err(|error| error.prefix_field(&name))?;
         self.parts.remarks.extend(triangle_mesh.remark().map(|remark| format!("{name}: {remark}")));
+        let parent = parent.and_then(|parent| self.organ_domains.get(&parent)).copied();
+        let kind = if matches!(organ, Organ::Shoot(_)) { OrganKind::Shoot } else { OrganKind::Leaf };
+        let mesh = OrganMesh {
+            faces: &faces,
+            origin: origin.into(),
+            positions: triangle_mesh.mesh.rest_positions(),
+            file_vertices: &triangle_mesh.file_vertices,
+        };
+        self.bodies.push(OrganBody {
+            kind,
+            parent: parent.map(|(index, _)| index),
+            origin: origin.into(),
+            flexible: self.create_flexible_body(organ, &mesh),
+        });
         self.parts.shapes.push(Shape::new(triangle_mesh.mesh, Modes::rigid())?);
-        let attachment =
-            parent.and_then(|parent| self.organ_domains.get(&parent)).map(|(index, parent_origin)| Attachment {
-                parent: *index,
-                frame: translation_transform([0, 1, 2].map(|axis| origin[axis] - parent_origin[axis])),
-                vertices: Vec::new(),
-            });
+        let attachment = parent.map(|(index, parent_origin)| Attachment {
+            parent: index,
+            frame: translation_transform([0, 1, 2].map(|axis| origin[axis] - parent_origin[axis])),
+            vertices: Vec::new(),
+        });
         self.organ_domains.insert(organ, (self.parts.domains.len(), origin));
-        let kind = if matches!(organ, Organ::Shoot(_)) { "shoot" } else { "leaf" };
+        let kind_note = if kind == OrganKind::Shoot { "shoot" } else { "leaf" };
+        let notes = [("plant.kind".into(), kind_note.into())].into();
         let mut domain = Domain {
             material: triangle_mesh.material,
             material_ranges: triangle_mesh.material_ranges,
             attachment,
-            metadata: Metadata { eigenvalues: Vec::new(), notes: [("plant.kind".into(), kind.into())].into() },
+            metadata: Metadata { notes, ..Metadata::default() },
             ..Domain::new(name, self.parts.shapes.len() - 1)
         };
         domain.set_placement(&Matrix4::new_translation(&origin.into()));
         self.parts.domains.push(domain);
         Ok(())
+    }
+
+    /// The beam and the skin of an organ, or why it is rigid.
+    fn create_flexible_body(&self, organ: Organ, mesh: &OrganMesh<'_>) -> Result<FlexibleBody, String> {
+        let relative = |points: &[[f64; 3]]| points.iter().map(|point| Vector3::from(*point) - mesh.origin).collect();
+        let OrganBeam { mut beam, rings } = match organ {
+            Organ::Shoot(index) => {
+                let shoot = &self.structure.shoots[index];
+                let radii = shoot.radii.as_ref().ok_or("it has no radii")?;
+                check_point_count(&shoot.vertices)?;
+                let points: Vec<_> = relative(&shoot.vertices);
+                OrganBeam::of_shoot(&points, radii, &self.materials)
+            }
+            Organ::Leaf(index) => {
+                let leaf = &self.structure.leaves[index];
+                let petiole = leaf.petiole_vertices.as_deref().unwrap_or_default();
+                check_point_count(petiole)?;
+                let petiole_points = self.triangles(mesh, |object| self.kind(object) == "petiole");
+                let geometry = LeafGeometry {
+                    petiole: relative(petiole),
+                    petiole_points: petiole_points.into_iter().flatten().collect(),
+                    base: Vector3::from(leaf.base) - mesh.origin,
+                    blade: self.triangles(mesh, |object| object == leaf.object_id),
+                };
+                OrganBeam::of_leaf(&geometry, &self.materials)
+            }
+        }
+        .map_err(|error| error.to_string())?;
+        let mut skin = Skin::new(&beam, &rings, mesh.positions);
+        for object in self.rigid_objects(mesh) {
+            let triangles = self.triangles(mesh, |other| other == object);
+            let distance = |point: &Vector3<f64>| (beam.nearest_station(point), *point);
+            let nearest = triangles.iter().flatten().map(distance).min_by(|a, b| a.0.1.total_cmp(&b.0.1));
+            let Some(((station, _), _)) = nearest else { continue };
+            let is_part = |vertex: &u32| {
+                let file_vertex = mesh.file_vertices[*vertex as usize];
+                self.object_of_vertex[file_vertex as usize] == object
+            };
+            let vertices: Vec<u32> = (0..mesh.positions.len() as u32).filter(is_part).collect();
+            skin.fix_to_section(&vertices, &beam, station);
+            let body = solid_inertia(&triangles, self.materials.wood().density, &beam.center(station));
+            beam.add_own_body(station, body);
+        }
+        Ok(FlexibleBody { beam, skin })
+    }
+
+    fn kind(&self, object: u64) -> &str {
+        self.structure.objects.get(&object).map_or("", String::as_str)
+    }
+
+    /// The objects of an organ that do not bend: neither a stem nor a petiole nor a leaf.
+    fn rigid_objects(&self, mesh: &OrganMesh<'_>) -> Vec<u64> {
+        let mut objects: Vec<u64> = mesh.faces.iter().map(|face| self.object_ids[*face]).collect();
+        objects.sort_unstable();
+        objects.dedup();
+        objects.retain(|object| !["internode", "petiole", "leaf"].contains(&self.kind(*object)));
+        objects
+    }
+
+    /// The triangles of the faces of some objects, relative to the origin of the domain.
+    fn triangles(&self, mesh: &OrganMesh<'_>, is_chosen: impl Fn(u64) -> bool) -> Vec<[Vector3<f64>; 3]> {
+        let mut triangles = Vec::new();
+        for face in mesh.faces.iter().filter(|face| is_chosen(self.object_ids[**face])) {
+            let place = |corner: &polygons::Corner| {
+                Vector3::from(self.polygons.positions[corner.vertex as usize]) - mesh.origin
+            };
+            let corners: Vec<Vector3<f64>> = self.polygons.corners_of(*face).iter().map(place).collect();
+            triangles.extend((2..corners.len()).map(|index| [corners[0], corners[index - 1], corners[index]]));
+        }
+        triangles
+    }
+}
+
+fn check_point_count(polyline: &[[f64; 3]]) -> Result<(), String> {
+    match polyline.len() {
+        0..=MAX_BEAM_POINTS => Ok(()),
+        count => Err(format!("expected at most {MAX_BEAM_POINTS} points of its polyline, got {count}")),
     }
 }
 
@@ -160,7 +308,7 @@ mod tests {
         for (name, text) in [("p.obj", OBJ), ("p_object_id.dat", IDS), ("p.structure.json", JSON)].iter().chain(files) {
             std::fs::write(folder.path().join(name), text).expect("a writable file");
         }
-        read(&AssetDir::unrestricted(folder.path()), "p.obj", CreaseAngle::default())
+        read(&AssetDir::unrestricted(folder.path()), "p.obj", ModelOptions::default())
     }
 
     #[test]

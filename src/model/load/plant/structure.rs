@@ -11,6 +11,9 @@ pub(super) struct Shoot {
     /// Id of the parent shoot; negative if the shoot has no parent.
     pub(super) parent: i64,
     pub(super) vertices: Vec<[f64; 3]>,
+    /// One radius per vertex, in scene units; `None` if the file has none.
+    #[serde(default)]
+    pub(super) radii: Option<Vec<f64>>,
 }
 
 /// A leaf or leaflet. Leaflets of one petiole have the same `shoot`, `node` and `petiole`. One of them has the polyline
@@ -56,7 +59,7 @@ impl PlantStructure {
     ///
     /// # Errors
     /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty
-    /// polyline, or a leaf that is not an object or is duplicated.
+    /// polyline, a negative radius, radii and vertices of different numbers, or a leaf that is not an object or is duplicated.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let file: StructureJson =
             serde_json::from_slice(bytes).map_err(|error| invalid("json", "objects, shoots and leaves", error))?;
@@ -71,6 +74,7 @@ impl PlantStructure {
         let parent_first_order = topological_order(&file.shoots, &shoot_indices)?;
         let structure = Self { objects, shoots: file.shoots, leaves: file.leaves, parent_first_order, shoot_indices };
         structure.check_polylines()?;
+        structure.check_radii()?;
         structure.check_leaves()?;
         Ok(structure)
     }
@@ -96,6 +100,21 @@ impl PlantStructure {
                     "a polyline of finite points",
                     format!("{} points: {:.3?}", polyline.len(), polyline.first()),
                 ));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_radii(&self) -> Result<()> {
+        for shoot in &self.shoots {
+            let Some(radii) = &shoot.radii else { continue };
+            let field = || format!("shoot {}: radii", shoot.id);
+            if radii.len() != shoot.vertices.len() {
+                return Err(invalid(field(), format!("{} (one per vertex)", shoot.vertices.len()), radii.len()));
+            }
+            let is_valid = |radius: &f64| (*radius as f32).is_finite() && *radius >= 0.0;
+            if let Some(radius) = radii.iter().find(|radius| !is_valid(radius)) {
+                return Err(invalid(field(), "finite numbers of at least 0", radius));
             }
         }
         Ok(())
@@ -182,6 +201,10 @@ mod tests {
         format!(r#"{{"id": {id}, "parent": {parent}, "vertices": [[0, 0, 0]], "more": 1}}"#)
     }
 
+    fn shoot_with_radii(radii: &str) -> String {
+        format!(r#"{{"id": 0, "parent": -1, "vertices": [[0, 0, 0], [0, 0, 1]], "radii": {radii}}}"#)
+    }
+
     fn leaf_json(object_id: u64, shoot: i64, base: &str) -> String {
         format!(r#"{{"object_id": {object_id}, "shoot": {shoot}, "node": 0, "petiole": 0, "base": {base}}}"#)
     }
@@ -190,6 +213,14 @@ mod tests {
     fn parent_shoots_precede_their_children() {
         let text = [shoot_json(7, 3), shoot_json(3, -1), shoot_json(9, 7), shoot_json(4, -1)].join(",");
         assert_eq!(parse(&text, "").expect("a valid structure").parent_first_order, [1, 3, 0, 2]);
+    }
+
+    #[test]
+    fn radii_are_optional() {
+        let radii = |text: &str| parse(text, "").expect("a valid structure").shoots[0].radii.clone();
+        assert_eq!(radii(&shoot_with_radii("[0.5, 0]")), Some(vec![0.5, 0.0]));
+        assert_eq!(radii(&shoot_with_radii("null")), None);
+        assert_eq!(radii(&shoot_json(0, -1)), None);
     }
 
     #[test]
@@ -203,6 +234,14 @@ mod tests {
             ),
             ([shoot_json(0, -1), shoot_json(0, -1)].join(","), String::new(), "shoots: expected different ids"),
             (r#"{"id": 0, "parent": -1, "vertices": []}"#.into(), String::new(), "shoot 0: expected a polyline"),
+            (shoot_with_radii("[1]"), String::new(), "shoot 0: radii: expected 2 (one per vertex), got 1"),
+            (
+                shoot_with_radii("[1, -1]"),
+                String::new(),
+                "shoot 0: radii: expected finite numbers of at least 0, got -1",
+            ),
+            (shoot_with_radii("[1, 1e300]"), String::new(), "shoot 0: radii: expected finite numbers"),
+            (shoot_with_radii("[1, null]"), String::new(), "json: expected objects, shoots and leaves"),
             (shoot_json(0, -1), leaf_json(2, 1, "[0,0,0]"), "leaf 2: expected the id of a shoot, got 1"),
             (shoot_json(0, -1), leaf_json(1, 0, "[0,0,0]"), "leaf 1: expected the object_id of a leaf"),
             (shoot_json(0, -1), leaf_json(2, 0, "[0,1e300,0]"), "leaf 2: expected a polyline of finite points"),

@@ -17,6 +17,8 @@ pub(in crate::load) struct TriangleMesh {
     pub(in crate::load) material: usize,
     /// The ranges of all materials; empty if there is only one material.
     pub(in crate::load) material_ranges: Vec<MaterialRange>,
+    /// The vertex of the file for each vertex of the mesh. Empty if the mesh has all vertices of the file.
+    pub(in crate::load) file_vertices: Vec<u32>,
     /// Number of polygons that are drawn as a fan, because they intersect themselves too often.
     inexact_polygons: usize,
 }
@@ -155,8 +157,11 @@ impl<'a> MeshBuilder<'a> {
         let mesh =
             Mesh::new(self.rest_positions, Corners { vertices: self.corner_vertices, normals, uvs }, self.triangles)?
                 .with_inner_edges(self.inner_edges)?;
+        let new_indices = self.new_indices.unwrap_or_default();
+        let mut file_vertices = vec![0; new_indices.len()];
+        new_indices.into_iter().for_each(|(file_vertex, vertex)| file_vertices[vertex as usize] = file_vertex);
         let (origin, inexact_polygons) = (self.origin, self.inexact_polygons);
-        Ok(TriangleMesh { mesh, origin, material, material_ranges, inexact_polygons })
+        Ok(TriangleMesh { mesh, origin, material, material_ranges, file_vertices, inexact_polygons })
     }
 
     /// The normals of the corners. Corners whose normal is missing or zero in the file are split at creases.
@@ -265,6 +270,7 @@ mod tests {
             build_faces(&parse_squares(), &[1], [1.0, 0.0, 0.5], CreaseAngle::default()).expect("a valid OBJ file");
         let rest_positions = [[0.0, 0.0, -0.5], [1.0, 0.0, -0.5], [1.0, 1.0, -0.5], [0.0, 1.0, -0.5]];
         assert_eq!(obj_mesh.mesh.rest_positions(), rest_positions);
+        assert_eq!(obj_mesh.file_vertices, [5, 6, 7, 8]);
         assert!(obj_mesh.mesh.corners().uvs.is_empty());
     }
 

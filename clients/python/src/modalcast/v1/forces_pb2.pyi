@@ -78,11 +78,13 @@ class StreamForcesResponse(_message.Message):
     def __init__(self, step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., forces: _Optional[_Iterable[_Union[AppliedForce, _Mapping]]] = ..., receiver_error: _Optional[str] = ...) -> None: ...
 
 class AppliedForce(_message.Message):
-    __slots__ = ("owner", "force", "f_q")
+    __slots__ = ("owner", "force", "f_q", "rest_point")
     OWNER_FIELD_NUMBER: _ClassVar[int]
     FORCE_FIELD_NUMBER: _ClassVar[int]
     F_Q_FIELD_NUMBER: _ClassVar[int]
+    REST_POINT_FIELD_NUMBER: _ClassVar[int]
     owner: int
     force: Force
     f_q: bytes
-    def __init__(self, owner: _Optional[int] = ..., force: _Optional[_Union[Force, _Mapping]] = ..., f_q: _Optional[bytes] = ...) -> None: ...
+    rest_point: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, owner: _Optional[int] = ..., force: _Optional[_Union[Force, _Mapping]] = ..., f_q: _Optional[bytes] = ..., rest_point: _Optional[_Iterable[float]] = ...) -> None: ...

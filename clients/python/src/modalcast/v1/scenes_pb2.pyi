@@ -399,7 +399,7 @@ class TextureDescription(_message.Message):
     def __init__(self, texture: _Optional[int] = ..., name: _Optional[str] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., bytes: _Optional[int] = ..., sha256: _Optional[bytes] = ...) -> None: ...
 
 class DomainDescription(_message.Message):
-    __slots__ = ("domain", "name", "shape", "material", "material_ranges", "placement", "rest_q", "parent", "attachment_frame", "attachment_vertices", "follows", "follow_frame", "shares_q_with", "eigenvalues", "notes", "exact_placement")
+    __slots__ = ("domain", "name", "shape", "material", "material_ranges", "placement", "rest_q", "parent", "attachment_frame", "attachment_vertices", "follows", "follow_frame", "shares_q_with", "eigenvalues", "notes", "exact_placement", "inertia")
     class NotesEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -423,6 +423,7 @@ class DomainDescription(_message.Message):
     EIGENVALUES_FIELD_NUMBER: _ClassVar[int]
     NOTES_FIELD_NUMBER: _ClassVar[int]
     EXACT_PLACEMENT_FIELD_NUMBER: _ClassVar[int]
+    INERTIA_FIELD_NUMBER: _ClassVar[int]
     domain: int
     name: str
     shape: int
@@ -439,7 +440,22 @@ class DomainDescription(_message.Message):
     eigenvalues: Eigenvalues
     notes: _containers.ScalarMap[str, str]
     exact_placement: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, domain: _Optional[int] = ..., name: _Optional[str] = ..., shape: _Optional[int] = ..., material: _Optional[int] = ..., material_ranges: _Optional[_Iterable[_Union[MaterialRange, _Mapping]]] = ..., placement: _Optional[bytes] = ..., rest_q: _Optional[bytes] = ..., parent: _Optional[int] = ..., attachment_frame: _Optional[bytes] = ..., attachment_vertices: _Optional[_Iterable[int]] = ..., follows: _Optional[int] = ..., follow_frame: _Optional[bytes] = ..., shares_q_with: _Optional[int] = ..., eigenvalues: _Optional[_Union[Eigenvalues, _Mapping]] = ..., notes: _Optional[_Mapping[str, str]] = ..., exact_placement: _Optional[_Iterable[float]] = ...) -> None: ...
+    inertia: Inertia
+    def __init__(self, domain: _Optional[int] = ..., name: _Optional[str] = ..., shape: _Optional[int] = ..., material: _Optional[int] = ..., material_ranges: _Optional[_Iterable[_Union[MaterialRange, _Mapping]]] = ..., placement: _Optional[bytes] = ..., rest_q: _Optional[bytes] = ..., parent: _Optional[int] = ..., attachment_frame: _Optional[bytes] = ..., attachment_vertices: _Optional[_Iterable[int]] = ..., follows: _Optional[int] = ..., follow_frame: _Optional[bytes] = ..., shares_q_with: _Optional[int] = ..., eigenvalues: _Optional[_Union[Eigenvalues, _Mapping]] = ..., notes: _Optional[_Mapping[str, str]] = ..., exact_placement: _Optional[_Iterable[float]] = ..., inertia: _Optional[_Union[Inertia, _Mapping]] = ...) -> None: ...
+
+class Inertia(_message.Message):
+    __slots__ = ("mass", "center", "moments", "modal_momenta", "modal_masses")
+    MASS_FIELD_NUMBER: _ClassVar[int]
+    CENTER_FIELD_NUMBER: _ClassVar[int]
+    MOMENTS_FIELD_NUMBER: _ClassVar[int]
+    MODAL_MOMENTA_FIELD_NUMBER: _ClassVar[int]
+    MODAL_MASSES_FIELD_NUMBER: _ClassVar[int]
+    mass: float
+    center: _containers.RepeatedScalarFieldContainer[float]
+    moments: _containers.RepeatedScalarFieldContainer[float]
+    modal_momenta: _containers.RepeatedScalarFieldContainer[float]
+    modal_masses: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, mass: _Optional[float] = ..., center: _Optional[_Iterable[float]] = ..., moments: _Optional[_Iterable[float]] = ..., modal_momenta: _Optional[_Iterable[float]] = ..., modal_masses: _Optional[_Iterable[float]] = ...) -> None: ...
 
 class MaterialRange(_message.Message):
     __slots__ = ("first_triangle", "material")

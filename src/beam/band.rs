@@ -8,24 +8,24 @@ const WIDTH: usize = 12;
 
 /// A symmetric band matrix, or a lower triangular factor of one.
 #[derive(Debug, Clone)]
-pub(super) struct BandMatrix {
-    /// Per row: the entries up to the diagonal, which is the last one. Entries left of the first column are 0.
+pub(crate) struct BandMatrix {
+    /// Per row: the entries up to the diagonal, which is the last one. Entries left of the first column are not used.
     rows: Vec<[f64; WIDTH]>,
 }
 
 impl BandMatrix {
     /// A matrix of zeros.
-    pub(super) fn zeros(size: usize) -> Self {
+    pub(crate) fn zeros(size: usize) -> Self {
         Self { rows: vec![[0.0; WIDTH]; size] }
     }
 
     /// The number of rows.
-    pub(super) const fn size(&self) -> usize {
+    pub(crate) const fn size(&self) -> usize {
         self.rows.len()
     }
 
     /// Adds to an entry of the lower triangle. `column` is at most `row` and at least `row - 11`.
-    pub(super) fn add(&mut self, row: usize, column: usize, value: f64) {
+    pub(crate) fn add(&mut self, row: usize, column: usize, value: f64) {
         self.rows[row][WIDTH - 1 + column - row] += value;
     }
 
@@ -38,8 +38,13 @@ impl BandMatrix {
         self.rows[row][WIDTH - 1 + column - row]
     }
 
+    /// The matrix without its first `count` rows and columns.
+    pub(crate) fn without_first(&self, count: usize) -> Self {
+        Self { rows: self.rows[count.min(self.size())..].to_vec() }
+    }
+
     /// The product with the columns of `vectors`.
-    pub(super) fn multiply(&self, vectors: &DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn multiply(&self, vectors: &DMatrix<f64>) -> DMatrix<f64> {
         let mut product = DMatrix::zeros(vectors.nrows(), vectors.ncols());
         for (x, mut y) in vectors.column_iter().zip(product.column_iter_mut()) {
             for row in 0..self.size() {
@@ -56,7 +61,7 @@ impl BandMatrix {
     }
 
     /// The lower triangular L with L L^T equal to this matrix; `None` unless the matrix is positive definite.
-    pub(super) fn factor(&self) -> Option<Self> {
+    pub(crate) fn factor(&self) -> Option<Self> {
         let mut factor = self.clone();
         for row in 0..self.size() {
             for column in Self::columns(row).chain([row]) {
@@ -75,7 +80,7 @@ impl BandMatrix {
     }
 
     /// Solves L X = `vectors` for a factor L.
-    pub(super) fn solve_lower(&self, mut vectors: DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn solve_lower(&self, mut vectors: DMatrix<f64>) -> DMatrix<f64> {
         for mut x in vectors.column_iter_mut() {
             for row in 0..self.size() {
                 let products = Self::columns(row).map(|column| self.entry(row, column) * x[column]);
@@ -86,7 +91,7 @@ impl BandMatrix {
     }
 
     /// Solves L^T X = `vectors` for a factor L.
-    pub(super) fn solve_upper(&self, mut vectors: DMatrix<f64>) -> DMatrix<f64> {
+    pub(crate) fn solve_upper(&self, mut vectors: DMatrix<f64>) -> DMatrix<f64> {
         for mut x in vectors.column_iter_mut() {
             for row in (0..self.size()).rev() {
                 x[row] /= self.entry(row, row);
@@ -100,19 +105,19 @@ impl BandMatrix {
 
     /// All entries.
     #[cfg(test)]
-    pub(super) fn to_dense(&self) -> DMatrix<f64> {
+    pub(crate) fn to_dense(&self) -> DMatrix<f64> {
         self.multiply(&DMatrix::identity(self.size(), self.size()))
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::random::SplitMix64;
     use super::*;
+    use crate::testing::Random;
 
     #[test]
     fn operations_agree_with_dense_ones() {
-        let mut random = SplitMix64::new(3);
+        let mut random = Random::new(3);
         let mut matrix = BandMatrix::zeros(31);
         for row in 0..31 {
             for column in BandMatrix::columns(row) {
@@ -128,6 +133,19 @@ mod tests {
         let factor = matrix.factor().expect("a positive definite matrix");
         let solution = factor.solve_upper(factor.solve_lower(vectors.clone()));
         assert!((dense * solution - vectors).norm() <= 1e-12);
+    }
+
+    #[test]
+    fn first_rows_and_columns_can_be_removed() {
+        let mut matrix = BandMatrix::zeros(20);
+        for row in 0..20 {
+            BandMatrix::columns(row)
+                .chain([row])
+                .for_each(|column| matrix.add(row, column, (20 * row + column) as f64));
+        }
+        let expected = matrix.to_dense().view((6, 6), (14, 14)).into_owned();
+        assert_eq!(matrix.without_first(6).to_dense(), expected);
+        assert_eq!(matrix.without_first(30).size(), 0);
     }
 
     #[test]
