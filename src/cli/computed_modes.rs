@@ -1,4 +1,4 @@
-//! Modes that `modalcast view` computes from a surface: runs the program `modalcast-modes`, and keeps its files in the
+//! Modes that `modalcast view` computes from a surface or a volume mesh: runs the program `modalcast-modes`, and keeps its files in the
 //! user's cache folder.
 
 use std::fs::{self, File};
@@ -217,9 +217,11 @@ fn files_of(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The files that an OBJ file (material libraries) or a glTF file (buffers) refers to and that contain more than images.
+/// The files that an OBJ file (material libraries), a glTF file (buffers) or a Vega mesh (included files, and fixed vertices
+/// beside it) refers to and that contain more than images.
 fn referenced_files(path: &Path) -> Vec<PathBuf> {
     let extension = path.extension().unwrap_or_default().to_ascii_lowercase();
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let names: Vec<String> = match (extension.to_str(), path.is_file()) {
         (Some("obj"), true) => {
             let text = fs::read(path).unwrap_or_default();
@@ -234,9 +236,17 @@ fn referenced_files(path: &Path) -> Vec<PathBuf> {
             let buffers = json["buffers"].as_array().into_iter().flatten();
             buffers.filter_map(|buffer| buffer["uri"].as_str().map(str::to_owned)).collect()
         }
+        (Some("veg"), true) => {
+            let text = fs::read(path).unwrap_or_default();
+            let lines =
+                text.split(|byte| *byte == b'\n').filter_map(|line| line.trim_ascii().strip_prefix(b"*INCLUDE"));
+            let included = lines.map(|name| String::from_utf8_lossy(name.trim_ascii()).into_owned());
+            let is_list = |file: &PathBuf| file.extension().is_some_and(|extension| extension == "bou");
+            let lists = files_of(folder).into_iter().filter(is_list);
+            included.chain(lists.filter_map(|file| Some(file.file_name()?.to_str()?.to_owned()))).collect()
+        }
         _ => Vec::new(),
     };
-    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
     names.iter().take(MAX_HASHED_FILES).filter_map(|name| load::find_referenced_file(folder, name)).collect()
 }
 
@@ -376,6 +386,13 @@ mod tests {
         for content in [b"1", b"2"] {
             write(path("d.mtl"), content);
             keys.push(key("d.obj", &options("x<0")));
+        }
+        write(path("e.veg"), b"*SET a\n*INCLUDE e.txt\n");
+        for name in ["e.txt", "e.bou"] {
+            for content in [b"1", b"2"] {
+                write(path(name), content);
+                keys.push(key("e.veg", &options("x<0")));
+            }
         }
         let different: std::collections::BTreeSet<&String> = keys.iter().collect();
         assert_eq!(different.len(), keys.len(), "{keys:?}");

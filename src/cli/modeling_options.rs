@@ -1,21 +1,26 @@
-//! Options of the computation of modes from a surface. `modalcast view` and the program `modalcast-modes` share them, so
+//! Options of the computation of modes from a surface or a volume mesh. `modalcast view` and the program `modalcast-modes` share them, so
 //! that both have the same flags. The program parses the strings.
 
-/// How modes are computed from a surface. An option that is not given has the default of the program.
+/// How modes are computed from a surface or a volume mesh. An option that is not given has the default of the program.
 #[derive(Debug, Clone, Default, PartialEq, clap::Args)]
 #[command(next_help_heading = "Computation of modes")]
 pub(crate) struct ModelingOptions {
-    /// Number of elastic modes. The rigid modes of a free part are not counted [default: 20].
+    /// Number of elastic modes. The rigid modes of a free part are not counted [default: 20; 5 with --large].
     #[arg(long, value_name = "N")]
     pub(crate) modes: Option<usize>,
+    /// Large motion of a volume mesh: adds the N (N + 1) / 2 derivatives of the N modes to U, and writes the cubic forces of
+    /// a Saint Venant-Kirchhoff material beside the model, as NAME.cub. At most 9 modes.
+    #[arg(long)]
+    pub(crate) large: bool,
     /// Only modes up to this frequency, in Hz. At most --modes, if both are given.
     #[arg(long, value_name = "HZ", allow_hyphen_values = true)]
     pub(crate) max_frequency: Option<f64>,
-    /// Limit on the unknowns of the computation (three per node). More are finer and slower [default: 25000].
+    /// Limit on the unknowns of the computation (three per node). For a surface, more are finer and slower. A volume mesh
+    /// has as many as it has [default: 25000].
     #[arg(long, value_name = "N")]
     pub(crate) freedoms: Option<usize>,
     /// Material: a name such as steel, or E=Pa,nu=RATIO,rho=KG_PER_M3. GROUP:MATERIAL is for one group or shell of the
-    /// surface only; can be repeated [default: steel].
+    /// surface, or one group of elements, only; can be repeated [default: that of the file (.veg), else steel].
     #[arg(long, value_name = "MATERIAL", allow_hyphen_values = true)]
     pub(crate) material: Vec<String>,
     /// Damping of all modes as a fraction of critical damping, such as 0.01 [default: that of the material].
@@ -65,7 +70,8 @@ impl ModelingOptions {
         let repeated = [("material", &self.material), ("clamp", &self.clamp), ("point-mass", &self.point_mass)];
         let repeated =
             repeated.iter().flat_map(|(flag, values)| values.iter().map(move |value| format!("--{flag}={value}")));
-        single.into_iter().flatten().chain(repeated).collect()
+        let large = self.large.then(|| "--large".to_owned());
+        large.into_iter().chain(single.into_iter().flatten()).chain(repeated).collect()
     }
 }
 
@@ -87,14 +93,15 @@ mod tests {
 
     #[test]
     fn arguments_give_the_same_options() {
-        let words = "--modes 30 --max-frequency 1e4 --freedoms 9000 --material steel --material a:E=1e9,nu=0.3,rho=1 \
+        let words = "--large --modes 30 --max-frequency 1e4 --freedoms 9000 --material steel --material a:E=1e9,nu=0.3,rho=1 \
                      --damping 0.02 --clamp -z<0.1 --clamp=x>1 --thickness 0.1 --threads 2";
         let mut words: Vec<String> = words.split_whitespace().map(str::to_owned).collect();
         words.extend(["--point-mass".to_owned(), "-1 0 0 2.5".to_owned()]);
         let options = parse(&words);
         assert_eq!((options.modes, options.max_frequency, options.threads), (Some(30), Some(1e4), Some(2)));
         assert_eq!((options.clamp.join(";"), options.point_mass.join(";")), ("-z<0.1;x>1".into(), "-1 0 0 2.5".into()));
-        assert_eq!(options.arguments().len(), 11);
+        assert!(options.large);
+        assert_eq!(options.arguments().len(), 12);
         assert_eq!(parse(&options.arguments()), options);
         assert!(options.is_requested());
         let one_thread = ModelingOptions { threads: Some(1), ..options.clone() };

@@ -104,8 +104,8 @@ mod tests {
         let long_message = "x".repeat(2 * MAX_MESSAGE_CHARS);
         assert_eq!(message(code(5), &long_message).len(), MAX_MESSAGE_CHARS);
         // The last message of a process that has not failed, or that a signal has ended, is not the reason.
-        assert_eq!(message(code(0), "sim: tree: modes in wind 1"), "sim has ended (exit status: 0)");
-        assert_eq!(message(killed, "sim: tree: modes in wind 1"), "sim has ended (signal: 9 (SIGKILL))");
+        assert_eq!(message(code(0), "sim: tree: modes in a wind of 8 m/s"), "sim has ended (exit status: 0)");
+        assert_eq!(message(killed, "sim: tree: modes in a wind of 8 m/s"), "sim has ended (signal: 9 (SIGKILL))");
         assert_eq!(message(code(1), ""), "sim has ended (exit status: 1)");
     }
 }

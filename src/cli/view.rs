@@ -16,7 +16,7 @@ use super::{Completion, Outcome, print_line, recording};
 use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in, invalid};
-use modalcast_model::load::LoadOptions;
+use modalcast_model::load::{self, LoadOptions};
 
 /// The program that opens a URL in the user's browser (xdg-utils).
 const URL_OPENER: &str = "xdg-open";
@@ -31,12 +31,13 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view path/to/simpleBridge --no-sim
   modalcast view part.stl --unit mm --up y
   modalcast view part.stl --modes 20 --material steel --clamp 'z < 0.01'
+  modalcast view part.msh --unit mm                 a volume mesh, whose modes are computed
   modalcast view fork.npz --slow 500                pulled, and seen in slower motion than by default
   modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, a folder with one
-    /// model, or a recording: an .mcap file, which the browser plays.
+    /// model, a volume mesh (.msh, .vtk, .vtu or .veg), whose modes are computed, or a recording: an .mcap file, which the browser plays.
     model: String,
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
     #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
@@ -72,9 +73,15 @@ pub(super) struct Args {
 }
 
 impl Args {
-    /// The model to show: the given one or, with options of modes, a file with its modes.
+    /// Whether modes are computed: options of the computation are given, or the model is a volume mesh, which nothing else
+    /// opens.
+    fn computes_modes(&self) -> bool {
+        self.modeling.is_requested() || load::is_volume_mesh(&self.model)
+    }
+
+    /// The model to show: the given one or, if its modes are computed, a file with them.
     async fn model(&self) -> Result<Computed> {
-        match self.modeling.is_requested() {
+        match self.computes_modes() {
             true => computed_modes::compute(&self.model, &self.loading, &self.modeling).await,
             false => Ok(Computed::File(self.model.clone().into())),
         }
@@ -83,7 +90,7 @@ impl Args {
     /// The options with which the server opens its scenes.
     fn load_options(&self) -> LoadOptions {
         let options = self.loading.load_options();
-        match self.modeling.is_requested() {
+        match self.computes_modes() {
             // The file with computed modes is in meters, and Z is up.
             true => LoadOptions { unit: None, up: None, ..options },
             false => options,

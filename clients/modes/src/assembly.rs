@@ -1,12 +1,10 @@
 //! Stiffness and mass of the whole body as sparse block matrices.
 
-use std::sync::Arc;
-
 use faer::sparse::{SparseColMat, SymbolicSparseColMat};
 use rayon::prelude::*;
 
-use crate::cell_matrices::{CELL_FREEDOMS, CellMatrices};
-use crate::grid::CELL_NODES;
+/// The number of a node that is held: it has no row and no column.
+pub const HELD_NODE: u32 = u32::MAX;
 
 /// A 3 x 3 block, row-major.
 type Block = [f64; 9];
@@ -25,31 +23,39 @@ pub struct SystemMatrices {
 }
 
 impl SystemMatrices {
-    /// Adds the matrices of all pieces. `nodes` are the nodes of each piece. The result does not depend on the number of
-    /// threads, because each row adds its pieces in their order.
-    pub fn assemble(nodes: &[[u32; CELL_NODES]], node_count: usize, matrices: &[Arc<CellMatrices>]) -> Self {
-        let mut pieces_of_node: Vec<Vec<(u32, u8)>> = vec![Vec::new(); node_count];
-        for (piece, piece_nodes) in nodes.iter().enumerate() {
-            for (local, node) in piece_nodes.iter().enumerate() {
-                pieces_of_node[*node as usize].push((piece as u32, local as u8));
+    /// Adds the matrices of all elements. `nodes` are the nodes of each element; [`HELD_NODE`] has no freedoms.
+    /// `matrices` gives the stiffness of an element (row-major, 3 `N` squared, freedom `3 node + axis`) and its mass
+    /// (row-major, `N` squared). The result does not depend on the number of threads, because each row adds its
+    /// elements in their order.
+    pub fn assemble<'a, const N: usize>(
+        nodes: &[[u32; N]],
+        node_count: usize,
+        matrices: impl Fn(usize) -> (&'a [f64], &'a [f64]) + Sync,
+    ) -> Self {
+        let mut elements_of_node: Vec<Vec<(u32, u8)>> = vec![Vec::new(); node_count];
+        for (element, element_nodes) in nodes.iter().enumerate() {
+            for (local, node) in element_nodes.iter().enumerate().filter(|(_, node)| **node != HELD_NODE) {
+                elements_of_node[*node as usize].push((element as u32, local as u8));
             }
         }
-        let rows: Vec<(Vec<u32>, Vec<Block>, Vec<f64>)> = pieces_of_node
+        let rows: Vec<(Vec<u32>, Vec<Block>, Vec<f64>)> = elements_of_node
             .par_iter()
-            .map(|pieces| {
-                let mut neighbors: Vec<u32> = pieces.iter().flat_map(|(piece, _)| nodes[*piece as usize]).collect();
+            .map(|elements| {
+                let mut neighbors: Vec<u32> =
+                    elements.iter().flat_map(|(element, _)| nodes[*element as usize]).collect();
+                neighbors.retain(|node| *node != HELD_NODE);
                 neighbors.sort_unstable();
                 neighbors.dedup();
                 let mut stiffness = vec![[0.0; 9]; neighbors.len()];
                 let mut mass = vec![0.0; neighbors.len()];
-                for (piece, row) in pieces {
+                for (element, row) in elements {
                     let row = usize::from(*row);
-                    let cell = &matrices[*piece as usize];
-                    for (column, neighbor) in nodes[*piece as usize].iter().enumerate() {
+                    let (element_stiffness, element_mass) = matrices(*element as usize);
+                    for (column, neighbor) in nodes[*element as usize].iter().enumerate() {
                         let Ok(index) = neighbors.binary_search(neighbor) else { continue };
-                        mass[index] += cell.mass[row * CELL_NODES + column];
+                        mass[index] += element_mass[row * N + column];
                         for (entry, sum) in stiffness[index].iter_mut().enumerate() {
-                            *sum += cell.stiffness[(3 * row + entry / 3) * CELL_FREEDOMS + 3 * column + entry % 3];
+                            *sum += element_stiffness[(3 * row + entry / 3) * 3 * N + 3 * column + entry % 3];
                         }
                     }
                 }

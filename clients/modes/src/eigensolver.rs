@@ -202,25 +202,25 @@ fn choose_basis(cluster: &mut [(f64, Vec<f64>)]) {
         let combined: Vec<Vec<f64>> = directions.iter().map(combine).collect();
         cluster.iter_mut().zip(combined).for_each(|((_, vector), combined)| *vector = combined);
     }
-    for (_, vector) in cluster {
-        let largest = vector
-            .iter()
-            .copied()
-            .fold(0.0, |largest: f64, entry| if entry.abs() > largest.abs() { entry } else { largest });
-        if largest < 0.0 {
-            vector.iter_mut().for_each(|entry| *entry = -*entry);
-        }
+    cluster.iter_mut().for_each(|(_, vector)| make_largest_entry_positive(vector));
+}
+
+/// Makes the sign of a mode unique.
+pub(crate) fn make_largest_entry_positive(vector: &mut [f64]) {
+    let larger = |largest: f64, entry: &f64| if entry.abs() > largest.abs() { *entry } else { largest };
+    if vector.iter().fold(0.0, larger) < 0.0 {
+        vector.iter_mut().for_each(|entry| *entry = -*entry);
     }
 }
 
 /// The Cholesky factor of K + s M.
-struct Factor {
+pub(crate) struct Factor {
     symbolic: SymbolicCholesky<usize>,
     values: Vec<f64>,
 }
 
 impl Factor {
-    fn new(system: &SystemMatrices, shift: f64) -> Result<Self> {
+    pub(crate) fn new(system: &SystemMatrices, shift: f64) -> Result<Self> {
         let matrix = system.shifted_stiffness(shift);
         let params = CholeskySymbolicParams {
             supernodal_flop_ratio_threshold: SupernodalThreshold::FORCE_SUPERNODAL,
@@ -254,6 +254,14 @@ impl Factor {
             SymbolicCholeskyRaw::Supernodal(symbolic) => Some(SupernodalLltRef::new(symbolic, &self.values)),
             SymbolicCholeskyRaw::Simplicial(_) => None,
         }
+    }
+
+    /// (K + s M)^-1 b.
+    pub(crate) fn solve(&self, load: &[f64]) -> Vec<f64> {
+        let mut vector = self.permuted(load);
+        self.solve_lower(as_columns(&mut vector, 1));
+        self.solve_upper(as_columns(&mut vector, 1));
+        self.unpermuted(&vector)
     }
 
     fn solve_scratch(&self, columns: usize) -> StackReq {

@@ -9,19 +9,22 @@ use std::path::Path;
 use modalcast_model::error::{Result, fault_in, invalid};
 use ndarray::{Array1, Array2, Array3};
 use ndarray_npy::WriteNpyExt as _;
+use sha2::{Digest as _, Sha256};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
+use crate::large_motion::SafeRange;
+use crate::materials::Material;
 use crate::modeling::{Modeling, to_hertz};
 use crate::parameters::ModelingParameters;
-use crate::surface_file::SurfaceFile;
+use crate::part_file::ModelSource;
 
 /// Encodes the model. Z is up and lengths are in meters. Equal modes give equal bytes.
 ///
 /// # Errors
 /// `Fault` if an array has the wrong size.
-pub fn encode(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modeling) -> Result<Vec<u8>> {
-    let up_axis = file.up_axis;
+pub fn encode(source: ModelSource<'_>, parameters: &ModelingParameters, modeling: &Modeling) -> Result<Vec<u8>> {
+    let up_axis = source.up_axis;
     let mesh = &modeling.mesh;
     let (vertices, rank, faces) = (mesh.positions.len(), modeling.eigenvalues.len(), mesh.triangles.len());
     let mut archive = Archive::new();
@@ -47,7 +50,7 @@ pub fn encode(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Mo
         let count = mesh.material_colors.len();
         archive.add("material_colors", &Array2::from_shape_vec((count, 4), colors).map_err(fault_in("model"))?)?;
     }
-    let notes = serde_json::to_vec(&notes(file, parameters, modeling)).map_err(fault_in("model"))?;
+    let notes = serde_json::to_vec(&notes(source, parameters, modeling)).map_err(fault_in("model"))?;
     archive.add("notes", &Array1::from_vec(notes))?;
     archive.finish()
 }
@@ -82,23 +85,28 @@ pub fn write(path: &Path, bytes: &[u8], replace: bool) -> Result<()> {
 }
 
 /// The notes of a model: how it was made, and how accurate it is.
-fn notes(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modeling) -> BTreeMap<&'static str, String> {
+fn notes(
+    source: ModelSource<'_>,
+    parameters: &ModelingParameters,
+    modeling: &Modeling,
+) -> BTreeMap<&'static str, String> {
     let list = |values: &[f64]| values.iter().map(|value| format!("{value:.2e}")).collect::<Vec<_>>().join(" ");
-    let material = &parameters.material;
-    let describe = format!(
-        "{}: E = {:e} Pa, nu = {}, rho = {} kg/m3",
-        material.name, material.youngs_modulus, material.poissons_ratio, material.density
-    );
+    let describe = |material: &Material| {
+        format!(
+            "{}: E = {:e} Pa, nu = {}, rho = {} kg/m3",
+            material.name, material.youngs_modulus, material.poissons_ratio, material.density
+        )
+    };
     let frequencies: Vec<String> =
         modeling.eigenvalues.iter().map(|eigenvalue| format!("{:.6}", to_hertz(*eigenvalue))).collect();
     let mut notes = BTreeMap::from([
         // The physics process reads these two notes. All columns of U are elastic.
         ("damping_ratio", modeling.damping_ratio.to_string()),
         ("rigid_modes", "0".into()),
-        ("modes.source", file.name.clone()),
-        ("modes.source_sha256", file.sha256.clone()),
+        ("modes.source", source.name.to_owned()),
+        ("modes.source_sha256", source.sha256.to_owned()),
         ("modes.unit", parameters.unit.to_string()),
-        ("modes.material", describe),
+        ("modes.material", describe(&parameters.material)),
         ("modes.mass", format!("{:.6e}", modeling.mass)),
         ("modes.free_rigid_modes", modeling.rigid_modes.to_string()),
         ("modes.parts", modeling.parts.to_string()),
@@ -108,6 +116,23 @@ fn notes(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modelin
         ("modes.frequency_errors", list(&modeling.frequency_errors)),
         ("modes.residuals", list(&modeling.residuals)),
     ]);
+    if let Some(count) = modeling.tetrahedra {
+        notes.insert("modes.tetrahedra", count.to_string());
+        // A file can have materials of its own.
+        let materials =
+            modeling.group_materials.iter().map(|(group, material)| format!("{group}: {}", describe(material)));
+        notes.insert("modes.material", materials.collect::<Vec<_>>().join("; "));
+    }
+    if let Some(large_motion) = &modeling.large_motion {
+        // The physics process checks the hash of the forces beside the model, and the coordinates.
+        notes.insert("modes.cubic_sha256", hexadecimal(&Sha256::digest(large_motion.force.encode())));
+        let list = |value: fn(&SafeRange) -> f64| {
+            large_motion.safe_ranges.iter().map(|range| format!("{:.6e}", value(range))).collect::<Vec<_>>().join(" ")
+        };
+        notes.insert("modes.safe_coordinates", list(|range| range.coordinate));
+        notes.insert("modes.safe_displacements", list(|range| range.displacement));
+        notes.insert("modes.linear_modes", large_motion.linear_modes.to_string());
+    }
     if !parameters.clamps.is_empty() {
         notes.insert("modes.clamps", parameters.clamps.join("; "));
     }
@@ -116,6 +141,10 @@ fn notes(file: &SurfaceFile, parameters: &ModelingParameters, modeling: &Modelin
         text.push_str(&format!("{name}: {}; ", group_material.name));
     }
     notes
+}
+
+fn hexadecimal(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Rotates a vector, so that the axis that points up becomes z.

@@ -1,5 +1,6 @@
 //! The computation as a whole: from a surface file to modes at its vertices.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use modalcast_model::error::{Result, invalid};
@@ -13,6 +14,7 @@ use crate::constraints::{SPRING_FACTOR, embed_held_points};
 use crate::eigensolver::{ElasticModes, find_elastic_modes};
 use crate::embedding::{EmbeddedPoint, embed};
 use crate::grid::{CELL_NODES, Grid};
+use crate::large_motion::LargeMotion;
 use crate::materials::Material;
 use crate::parameters::ModelingParameters;
 use crate::refinement::divide_long_edges;
@@ -36,17 +38,23 @@ pub struct Modeling {
     /// |K x - lambda M x| / |lambda M x| of each mode.
     pub residuals: Vec<f64>,
     pub freedoms: usize,
-    /// Side of a cell, meters.
+    /// Side of a cell, meters. For a volume mesh, the mean length of the edges.
     pub cell_size: f64,
+    /// Quadratic tetrahedra of a volume mesh; `None` for a surface.
+    pub tetrahedra: Option<usize>,
+    /// Names of the groups of a volume mesh, with their materials. Empty for a surface.
+    pub group_materials: Vec<(String, Material)>,
     /// Connected parts.
     pub parts: usize,
     /// Rigid motions: six per part that is not held. They are no columns of U.
     pub rigid_modes: usize,
-    /// Kilograms, with point masses, without the material in held regions.
+    /// Kilograms, with point masses. Without the material in held regions, which a surface loses.
     pub mass: f64,
     /// Extents of the surface, meters.
     pub size: [f64; 3],
     pub damping_ratio: f64,
+    /// The cubic forces of large motion. The columns of U are then linear modes and their derivatives.
+    pub large_motion: Option<LargeMotion>,
     /// Warnings about the input and the result.
     pub remarks: Vec<String>,
 }
@@ -66,31 +74,25 @@ const ASSUMED_ORDER: i32 = 3;
 /// Computes the modes of a surface.
 ///
 /// # Errors
-/// `Invalid` for a surface without volume, wrong groups, and clamps that hold nothing or everything; `Fault` if the
-/// eigenproblem cannot be solved.
+/// `Invalid` for a surface without volume, wrong groups, clamps that hold nothing or everything, and large motion; `Fault`
+/// if the eigenproblem cannot be solved.
 pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progress: &Progress<'_>) -> Result<Modeling> {
     progress(0.0, "surface");
+    if parameters.is_large {
+        let expected = "a volume mesh, such as that of `gmsh part.step -3 -order 2 -o part.msh`, because the cubic forces \
+                        need elements that follow the material";
+        return Err(invalid("--large", expected, format!("the surface '{}'", file.name)));
+    }
     let body = Body::new(file, parameters)?;
     let layout = body.finest_layout(parameters.freedoms, body.initial_cell_size(), 0.93)?;
     body.check_clamps(&layout.grid, &parameters.clamps)?;
-    if layout.freedoms() < 2 * parameters.modes {
-        let expected = format!("at most half of the {} freedoms", layout.freedoms());
-        return Err(invalid("--modes", expected, parameters.modes));
-    }
+    check_mode_count(layout.freedoms(), parameters.modes)?;
     let count = parameters.modes;
     let mut solution = solve(&body, &layout, parameters, count, &|share, stage| progress(0.05 + 0.65 * share, stage))?;
     let coarse_progress = |share: f64, stage: &str| progress(0.7 + 0.25 * share, stage);
     let mut frequency_errors = estimate_errors(&body, &layout, parameters, &solution.modes, &coarse_progress);
-    if let Some(frequency) = parameters.max_frequency {
-        let limit = (std::f64::consts::TAU * frequency).powi(2);
-        let count = solution.modes.eigenvalues.partition_point(|eigenvalue| *eigenvalue <= limit);
-        if count == 0 {
-            let expected = format!("at least {:.4} Hz, the first frequency", to_hertz(solution.modes.eigenvalues[0]));
-            return Err(invalid("--max-frequency", expected, frequency));
-        }
-        solution.modes.truncate(count);
-        frequency_errors.truncate(count);
-    }
+    remove_high_modes(&mut solution.modes, parameters)?;
+    frequency_errors.truncate(solution.modes.eigenvalues.len());
     progress(0.95, "interpolation");
     let (mesh, modes) = interpolate(&body, &layout, file, &solution.modes);
     let (low, high) = body.surface.bounds();
@@ -101,17 +103,44 @@ pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progre
         frequency_errors,
         freedoms: layout.freedoms(),
         cell_size: layout.grid.cell_size,
+        tetrahedra: None,
+        group_materials: Vec::new(),
         parts: layout.pieces.part_count,
         rigid_modes: solution.rigid_modes,
         mass: solution.mass,
         size: (high - low).into(),
         damping_ratio,
+        large_motion: None,
         remarks: file.remarks.clone(),
         eigenvalues: solution.modes.eigenvalues,
         residuals: solution.modes.residuals,
     };
     add_remarks(&body, &layout, parameters, &mut modeling);
     Ok(modeling)
+}
+
+/// Fails for more modes than half of the freedoms.
+pub(crate) fn check_mode_count(freedoms: usize, modes: usize) -> Result<()> {
+    match freedoms < 2 * modes {
+        true => Err(invalid("--modes", format!("at most half of the {freedoms} freedoms"), modes)),
+        false => Ok(()),
+    }
+}
+
+/// Removes the modes above the largest frequency.
+///
+/// # Errors
+/// `Invalid` if no mode remains.
+pub(crate) fn remove_high_modes(modes: &mut ElasticModes, parameters: &ModelingParameters) -> Result<()> {
+    let Some(frequency) = parameters.max_frequency else { return Ok(()) };
+    let limit = (std::f64::consts::TAU * frequency).powi(2);
+    let count = modes.eigenvalues.partition_point(|eigenvalue| *eigenvalue <= limit);
+    if count == 0 {
+        let expected = format!("at least {:.4} Hz, the first frequency", to_hertz(modes.eigenvalues[0]));
+        return Err(invalid("--max-frequency", expected, frequency));
+    }
+    modes.truncate(count);
+    Ok(())
 }
 
 /// The damping ratio of the materials, weighted by mass.
@@ -162,10 +191,14 @@ fn solve(
     }
     let mass = matrices.iter().map(|matrices| matrices.mass.iter().sum::<f64>()).sum();
     progress(0.05, "assembly");
-    let system = SystemMatrices::assemble(&layout.pieces.nodes, layout.pieces.node_count, &matrices);
+    let system = SystemMatrices::assemble(&layout.pieces.nodes, layout.pieces.node_count, |piece| {
+        (&matrices[piece].stiffness[..], &matrices[piece].mass[..])
+    });
     drop(matrices);
-    let rigid = rigid_motions(layout, &held);
-    let modes = find_elastic_modes(&system, &rigid, shift(body, layout), count, &|share, stage| {
+    let rigid = free_motions(layout, &held);
+    let size = largest_part(layout).min(body.diagonal());
+    let shift = small_eigenvalue(&body.materials, mean_thickness(body, layout), size);
+    let modes = find_elastic_modes(&system, &rigid, shift, count, &|share, stage| {
         progress(0.1 + 0.9 * share, stage);
     })?;
     Ok(Solution { modes, rigid_modes: rigid.len(), mass })
@@ -226,14 +259,14 @@ fn add_outer_product(matrix: &mut [f64], weights: &[f64; CELL_NODES], scale: f64
     }
 }
 
-/// Six rigid motions of each part without held points: translations, and rotations about the center of the part.
-fn rigid_motions(layout: &Layout, held: &[(EmbeddedPoint, f64)]) -> Vec<Vec<f64>> {
+/// The rigid motions of the parts without held points.
+fn free_motions(layout: &Layout, held: &[(EmbeddedPoint, f64)]) -> Vec<Vec<f64>> {
     let pieces = &layout.pieces;
     let mut is_held = vec![false; pieces.part_count];
     for (point, _) in held {
         is_held[pieces.parts[point.piece] as usize] = true;
     }
-    let mut nodes_of_part = vec![std::collections::BTreeMap::new(); pieces.part_count];
+    let mut nodes_of_part = vec![BTreeMap::new(); pieces.part_count];
     for (index, nodes) in pieces.nodes.iter().enumerate() {
         let cell = layout.grid.cell_at(pieces.pieces[index].cell);
         for (local, node) in nodes.iter().enumerate() {
@@ -242,23 +275,25 @@ fn rigid_motions(layout: &Layout, held: &[(EmbeddedPoint, f64)]) -> Vec<Vec<f64>
             nodes_of_part[pieces.parts[index] as usize].insert(*node as usize, position);
         }
     }
-    let mut motions = Vec::new();
-    for nodes in nodes_of_part.iter().zip(is_held).filter(|(_, is_held)| !is_held).map(|(nodes, _)| nodes) {
-        let center = nodes.values().sum::<Vector3<f64>>() / nodes.len() as f64;
-        for axis in 0..3 {
-            let unit = Vector3::ith(axis, 1.0);
-            let motion = |displacement: &dyn Fn(&Vector3<f64>) -> Vector3<f64>| {
-                let mut motion = vec![0.0; layout.freedoms()];
-                for (node, position) in nodes {
-                    motion[3 * node..3 * node + 3].copy_from_slice(displacement(position).as_slice());
-                }
-                motion
-            };
-            motions.push(motion(&|_| unit));
-            motions.push(motion(&|position| unit.cross(&(position - center))));
+    let free = nodes_of_part.iter().zip(is_held).filter(|(_, is_held)| !is_held).map(|(nodes, _)| nodes);
+    free.flat_map(|nodes| rigid_motions(layout.freedoms(), nodes)).collect()
+}
+
+/// Six rigid motions of a part: translations, and rotations about its center. `nodes` are the positions of its nodes.
+pub(crate) fn rigid_motions(freedoms: usize, nodes: &BTreeMap<usize, Vector3<f64>>) -> Vec<Vec<f64>> {
+    let center = nodes.values().sum::<Vector3<f64>>() / nodes.len() as f64;
+    let motion = |displacement: &dyn Fn(&Vector3<f64>) -> Vector3<f64>| {
+        let mut motion = vec![0.0; freedoms];
+        for (node, position) in nodes {
+            motion[3 * node..3 * node + 3].copy_from_slice(displacement(position).as_slice());
         }
-    }
-    motions
+        motion
+    };
+    let of_axis = |axis: usize| {
+        let unit: Vector3<f64> = Vector3::ith(axis, 1.0);
+        [motion(&|_| unit), motion(&|position| unit.cross(&(position - center)))]
+    };
+    (0..3).flat_map(of_axis).collect()
 }
 
 /// The mean thickness of the body, meters: that of a plate with its volume and area.
@@ -266,12 +301,10 @@ fn mean_thickness(body: &Body, layout: &Layout) -> f64 {
     2.0 * layout.volume_fractions().iter().sum::<f64>() * layout.grid.cell_size.powi(3) / body.surface.area()
 }
 
-/// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the mean thickness of the body and the size of its largest
-/// part.
-fn shift(body: &Body, layout: &Layout) -> f64 {
-    let thickness = mean_thickness(body, layout);
-    let speed = body.materials.iter().map(|material| material.bar_wave_speed()).fold(f64::INFINITY, f64::min);
-    0.01 * (speed * thickness / largest_part(layout).min(body.diagonal()).powi(2)).powi(2)
+/// A small eigenvalue, (rad/s)^2: 1/100 of that of a plate with the given thickness and size, in meters.
+pub(crate) fn small_eigenvalue(materials: &[Material], thickness: f64, size: f64) -> f64 {
+    let speed = materials.iter().map(|material| material.bar_wave_speed()).fold(f64::INFINITY, f64::min);
+    0.01 * (speed * thickness / size.powi(2)).powi(2)
 }
 
 /// The diagonal of the bounding box of the largest part, meters.
@@ -352,6 +385,28 @@ fn add_unit_remarks(material: &Material, remarks: &mut Vec<String>) {
     }
 }
 
+/// Adds the remarks that do not depend on the method. `diagonal` is that of the bounding box, meters.
+pub(crate) fn add_common_remarks(
+    materials: &[Material],
+    diagonal: f64,
+    parameters: &ModelingParameters,
+    rigid_modes: usize,
+    remarks: &mut Vec<String>,
+) {
+    if !(1e-3..=100.0).contains(&diagonal) {
+        let unit = parameters.unit;
+        remarks.push(format!("the part measures {diagonal:.3e} m from corner to corner; is '{unit}' its --unit?"));
+    }
+    for material in materials {
+        add_unit_remarks(material, remarks);
+    }
+    if rigid_modes > 0 {
+        let parts = rigid_modes / 6;
+        let text = if parts == 1 { "1 part is".to_owned() } else { format!("{parts} parts are") };
+        remarks.push(format!("{text} free: deformation in place, without rigid motions (--clamp holds a part)"));
+    }
+}
+
 /// Adds warnings about the input and the result.
 fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, modeling: &mut Modeling) {
     let remarks = &mut modeling.remarks;
@@ -368,19 +423,7 @@ fn add_remarks(body: &Body, layout: &Layout, parameters: &ModelingParameters, mo
         let text = if count == 1 { "1 part".to_owned() } else { format!("{count} parts") };
         remarks.push(format!("{text} with less than 0.1 % of the volume left out; such a part stays at rest"));
     }
-    let diagonal = body.diagonal();
-    if !(1e-3..=100.0).contains(&diagonal) {
-        let unit = parameters.unit;
-        remarks.push(format!("the part measures {diagonal:.3e} m from corner to corner; is '{unit}' its --unit?"));
-    }
-    for material in &body.materials {
-        add_unit_remarks(material, remarks);
-    }
-    if modeling.rigid_modes > 0 {
-        let parts = modeling.rigid_modes / 6;
-        let text = if parts == 1 { "1 part is".to_owned() } else { format!("{parts} parts are") };
-        remarks.push(format!("{text} free: deformation in place, without rigid motions (--clamp holds a part)"));
-    }
+    add_common_remarks(&body.materials, body.diagonal(), parameters, modeling.rigid_modes, remarks);
     let thickness = mean_thickness(body, layout);
     if thickness < MIN_THICKNESS * modeling.cell_size {
         remarks.push(format!(

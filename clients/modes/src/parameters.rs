@@ -4,6 +4,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::LengthUnit;
 use nalgebra::Vector3;
 
+use crate::large_motion::check_linear_modes;
 use crate::materials::Material;
 use crate::region::list_names;
 
@@ -18,6 +19,8 @@ pub struct ModelingParameters {
     pub freedoms: usize,
     /// The material of groups without one of their own.
     pub material: Material,
+    /// Whether `material` also replaces the materials of a file that has materials.
+    pub replaces_materials: bool,
     /// Names of groups, and their materials.
     pub group_materials: Vec<(String, Material)>,
     /// Replaces the damping ratio of the material.
@@ -29,6 +32,8 @@ pub struct ModelingParameters {
     pub point_masses: Vec<PointMass>,
     /// The thickness of a sheet.
     pub thickness: Option<f64>,
+    /// Whether modal derivatives and cubic forces of large motion are computed, which needs a volume mesh.
+    pub is_large: bool,
 }
 
 /// A mass without extent.
@@ -63,12 +68,14 @@ impl Default for ModelingParameters {
             max_frequency: None,
             freedoms: DEFAULT_FREEDOMS,
             material: steel,
+            replaces_materials: false,
             group_materials: Vec::new(),
             damping_ratio: None,
             unit: LengthUnit::METER,
             clamps: Vec::new(),
             point_masses: Vec::new(),
             thickness: None,
+            is_large: false,
         }
     }
 }
@@ -95,6 +102,9 @@ impl ModelingParameters {
         if let Some(thickness) = self.thickness {
             check(is_positive(thickness), "--thickness", "a length above 0", &thickness)?;
         }
+        if self.is_large {
+            check_linear_modes(self.modes)?;
+        }
         Ok(self)
     }
 
@@ -105,7 +115,10 @@ impl ModelingParameters {
     pub fn add_material(&mut self, text: &str) -> Result<()> {
         match text.rsplit_once(':') {
             Some((group, material)) => self.group_materials.push((group.trim().into(), Material::parse(material)?)),
-            None => self.material = Material::parse(text)?,
+            None => {
+                self.material = Material::parse(text)?;
+                self.replaces_materials = true;
+            }
         }
         Ok(())
     }
@@ -161,6 +174,7 @@ mod tests {
             (ModelingParameters { max_frequency: Some(f64::NAN), ..default() }, "--max-frequency"),
             (ModelingParameters { damping_ratio: Some(1.0), ..default() }, "--damping"),
             (ModelingParameters { thickness: Some(-1.0), ..default() }, "--thickness"),
+            (ModelingParameters { is_large: true, modes: 10, ..default() }, "--modes with --large: expected at most 9"),
         ] {
             let error = parameters.validated().expect_err("expected an error").to_string();
             assert!(error.starts_with(message), "{error}");

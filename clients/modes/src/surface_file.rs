@@ -87,7 +87,7 @@ pub fn read(path: &str, options: &LoadOptions) -> Result<SurfaceFile> {
 }
 
 /// The SHA-256 of a file, hexadecimal.
-fn hash_file(path: &Path) -> std::io::Result<String> {
+pub(crate) fn hash_file(path: &Path) -> std::io::Result<String> {
     let (mut file, mut hash, mut buffer) = (File::open(path)?, Sha256::new(), vec![0; 1 << 16]);
     loop {
         match file.read(&mut buffer)? {

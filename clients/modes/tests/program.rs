@@ -1,6 +1,7 @@
 //! The program `modalcast-modes`: from files to models.
 
 mod solids;
+mod volume_meshes;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -8,6 +9,7 @@ use std::time::{Duration, Instant};
 
 use modalcast_model::load;
 use modalcast_modes::surface_file::SurfaceFile;
+use modalcast_modes::volume_mesh::VolumeCells;
 use solids::{ellipsoid, solid_box};
 
 fn program(folder: &Path, arguments: &[&str]) -> Command {
@@ -71,6 +73,74 @@ fn stl_becomes_a_model_with_modes_eigenvalues_and_notes() {
     let positions = shape.mesh.rest_positions();
     assert!(positions.len() > 60, "{}", positions.len());
     assert!(positions.iter().all(|position| position[0].abs() <= 0.0501));
+}
+
+/// Writes a mesh of linear tetrahedra as a file of Vega.
+fn write_veg(path: &Path, cells: &VolumeCells) {
+    let mut text = format!("*VERTICES\n{} 3 0 0\n", cells.positions.len());
+    for (index, position) in cells.positions.iter().enumerate() {
+        text.push_str(&format!("{} {} {} {}\n", index + 1, position.x, position.y, position.z));
+    }
+    text.push_str(&format!("*ELEMENTS\nTET\n{} 4 0\n", cells.elements.len()));
+    for (index, [a, b, c, d, ..]) in cells.elements.iter().enumerate() {
+        text.push_str(&format!("{} {} {} {} {}\n", index + 1, a + 1, b + 1, c + 1, d + 1));
+    }
+    text.push_str("*MATERIAL alloy\nENU, 2700, 69e9, 0.33\n*REGION\nallElements, alloy\n");
+    std::fs::write(path, text).expect("expected a writable file");
+}
+
+#[test]
+fn volume_mesh_becomes_a_model_with_its_surface() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let mut cells = volume_meshes::linear(volume_meshes::solid_box([0.1, 0.01, 0.01], [20, 2, 2]));
+    write_veg(&folder.path().join("bar.veg"), &cells);
+    let held: Vec<String> = (1..)
+        .zip(&cells.positions)
+        .filter(|(_, position)| position.x < -0.0499)
+        .map(|(vertex, _): (i32, _)| vertex.to_string())
+        .collect();
+    std::fs::write(folder.path().join("bar.bou"), held.join(",")).expect("expected a writable file");
+    let model = |threads: &str| {
+        let output = format!("{threads}.npz");
+        let flags = ["bar.veg", "--modes", "6", "--threads", threads, "--json", "--out", &output, "--clamp"];
+        let output = run(folder.path(), &[&flags[..], &["group bar.bou"]].concat());
+        assert!(output.status.success(), "{output:?}");
+        output.stdout
+    };
+    let result: serde_json::Value = serde_json::from_slice(&model("1")).expect("expected JSON");
+    model("3");
+    let bytes = |name: &str| std::fs::read(folder.path().join(name)).expect("expected a model");
+    assert_eq!(bytes("1.npz"), bytes("3.npz"));
+    // Euler and Bernoulli: an aluminum bar of 100 mm with a square section of 10 mm.
+    let expected = 1.875_104_f64.powi(2) / std::f64::consts::TAU * 0.01 / 12.0_f64.sqrt() / 0.1_f64.powi(2)
+        * (69e9_f64 / 2700.0).sqrt();
+    let first = result["frequencies"][0].as_f64().expect("expected a frequency");
+    assert!((first / expected - 1.0).abs() < 0.02, "{first} instead of {expected}");
+    assert_eq!((&result["rigid_modes"], &result["tetrahedra"]), (&0.into(), &480.into()));
+    let scene = load::open(&folder.path().join("1.npz").to_string_lossy()).expect("expected a scene").scene;
+    let (shape, domain) = (scene.shape_of(0), &scene.domains[0]);
+    assert_eq!((shape.modes.rank(), domain.metadata.eigenvalues.len()), (6, 6));
+    // 4 sides of 20 x 2 and 2 ends of 2 x 2 squares, each with two faces of four triangles.
+    assert_eq!(shape.mesh.triangles().len(), 8 * (4 * 40 + 2 * 4));
+    for (note, value) in [
+        ("modes.tetrahedra", "480"),
+        ("modes.material", "alloy: alloy: E = 6.9e10 Pa, nu = 0.33, rho = 2700 kg/m3"),
+        ("modes.source", "bar.veg"),
+        ("modes.clamps", "group bar.bou"),
+    ] {
+        assert_eq!(domain.metadata.notes[note], value, "{note}");
+    }
+    assert!(!domain.metadata.notes["modes.residuals"].is_empty());
+    // Hexahedra and files without tetrahedra are refused with a way out.
+    let text = std::fs::read_to_string(folder.path().join("bar.veg")).expect("expected a file");
+    std::fs::write(folder.path().join("cubes.veg"), text.replace("TET", "CUBIC")).expect("expected a writable file");
+    let error = error_of(&run(folder.path(), &["cubes.veg"]));
+    assert!(error.contains("got 480 cubes (CUBIC)") && error.contains("-3 -order 2 -o cubes.msh"), "{error}");
+    cells.elements.truncate(1);
+    cells.positions[1] = cells.positions[0];
+    write_veg(&folder.path().join("flat.veg"), &cells);
+    let error = error_of(&run(folder.path(), &["flat.veg"]));
+    assert!(error.contains("file 'flat.veg': mesh: expected elements with a volume"), "{error}");
 }
 
 /// The modes do not depend on threads, so that caches and tests can compare bytes.
@@ -138,7 +208,7 @@ fn errors_name_what_is_wrong_and_leave_no_file() {
         ("box.stl --modes 300 --freedoms 500", "at most half"),
         ("box.stl --threads 0", "1 to 256"),
         ("box.stl --point-mass 1,2", "X Y Z KG"),
-        ("box.stl --out box.stl --force", "another file than the surface"),
+        ("box.stl --out box.stl --force", "another file than the part"),
         ("/dev/zero", "an existing model file"),
     ] {
         let output = run(folder.path(), &arguments.split(' ').collect::<Vec<_>>());

@@ -2,12 +2,16 @@
 
 use std::path::Path;
 
+use modalcast_modes::large_motion::LargeMotion;
 use modalcast_modes::modeling::to_hertz;
 use modalcast_modes::{Modeling, ModelingParameters};
 use serde_json::json;
 
 /// Frequencies that the text lists.
 const LISTED_FREQUENCIES: usize = 6;
+
+/// Groups whose materials the text lists.
+const LISTED_GROUPS: usize = 8;
 
 /// The result for other programs.
 pub(crate) fn json(out: &Path, modeling: &Modeling) -> serde_json::Value {
@@ -19,6 +23,7 @@ pub(crate) fn json(out: &Path, modeling: &Modeling) -> serde_json::Value {
         "vertices": modeling.mesh.positions.len(),
         "freedoms": modeling.freedoms,
         "cell_size": modeling.cell_size,
+        "tetrahedra": modeling.tetrahedra,
         "parts": modeling.parts,
         "rigid_modes": modeling.rigid_modes,
         "mass": modeling.mass,
@@ -26,6 +31,8 @@ pub(crate) fn json(out: &Path, modeling: &Modeling) -> serde_json::Value {
         "frequencies": frequencies,
         "frequency_errors": errors,
         "residuals": modeling.residuals,
+        "linear_modes": modeling.large_motion.as_ref().map(|large_motion| large_motion.linear_modes),
+        "safe_displacements": modeling.large_motion.as_ref().map(safe_displacements),
         "remarks": modeling.remarks,
     })
 }
@@ -43,12 +50,23 @@ pub(crate) fn text(out: &Path, parameters: &ModelingParameters, modeling: &Model
     let more = if count > listed.len() { ", ..." } else { "" };
     let mut text = format!(
         "size      {x} x {y} x {z} m\nmaterial  {}, mass {} kg\nmodes     {count}, at {}{more} Hz\n",
-        names_of_materials(parameters),
+        names_of_materials(parameters, modeling),
         format_number(modeling.mass),
         listed.join(", ")
     );
     if let Some(worst) = modeling.frequency_errors.iter().copied().reduce(f64::max) {
         text.push_str(&format!("error     about {} % (estimate for the worst mode)\n", format_number(100.0 * worst)));
+    }
+    if let Some(large_motion) = &modeling.large_motion {
+        let LargeMotion { linear_modes, .. } = large_motion;
+        let displacements = safe_displacements(large_motion).into_iter().map(format_number).collect::<Vec<_>>();
+        text.push_str(&format!(
+            "large     {linear_modes} modes and {} derivatives, cubic forces in {}\n          safe displacements of the \
+             modes: {} m (beyond, the material may collapse under compression)\n",
+            count - linear_modes,
+            out.with_extension("cub").display(),
+            displacements.join(", ")
+        ));
     }
     for remark in &modeling.remarks {
         text.push_str(&format!("remark    {remark}\n"));
@@ -57,8 +75,19 @@ pub(crate) fn text(out: &Path, parameters: &ModelingParameters, modeling: &Model
     text
 }
 
-/// The names of all materials, without repetitions.
-fn names_of_materials(parameters: &ModelingParameters) -> String {
+/// The largest displacement of each linear mode that is safe from collapse, meters.
+fn safe_displacements(large_motion: &LargeMotion) -> Vec<f64> {
+    large_motion.safe_ranges.iter().map(|range| range.displacement).collect()
+}
+
+/// The names of all materials with their groups.
+fn names_of_materials(parameters: &ModelingParameters, modeling: &Modeling) -> String {
+    if modeling.tetrahedra.is_some() {
+        let listed = modeling.group_materials.iter().take(LISTED_GROUPS);
+        let listed = listed.map(|(group, material)| format!("{} ({group})", material.name)).collect::<Vec<_>>();
+        let more = modeling.group_materials.len() - listed.len();
+        return listed.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() };
+    }
     let others = parameters.group_materials.iter().map(|(group, material)| format!("{} ({group})", material.name));
     std::iter::once(parameters.material.name.clone()).chain(others).collect::<Vec<_>>().join(", ")
 }

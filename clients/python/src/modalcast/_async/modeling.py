@@ -1,4 +1,4 @@
-"""Modes of a surface."""
+"""Modes of a surface or a volume mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ async def make_model(
     source: Surface,
     *,
     modes: int | None = 20,
-    material: str | Sequence[str] = "steel",
+    material: str | Sequence[str] | None = None,
     clamp: str | Sequence[str] | None = None,
     unit: str | None = None,
     up: str | None = None,
@@ -30,13 +30,14 @@ async def make_model(
     overwrite: bool = False,
     program: str | Path | None = None,
 ) -> ModalModel:
-    """Computes the modes of a part from its surface by the finite element method. Ctrl-C ends the computation.
+    """Computes the modes of a part from its surface or a volume mesh by finite elements. Ctrl-C ends the computation.
 
     Args:
-        source: An OBJ, PLY, STL, glTF or npz file; or arrays: the vertices, n x 3, and the faces, m x 3 or m x 4.
+        source: An OBJ, PLY, STL, glTF or npz file; a mesh of tetrahedra (Gmsh .msh, .vtk, .vtu, Vega .veg); the result
+            has its surface; or arrays: the vertices, n x 3, and the faces, m x 3 or m x 4.
         modes: Number of elastic modes; None: that of the program.
         material: A name such as "steel", or "E=2.1e11,nu=0.3,rho=7850" in Pa and kg/m^3. With several, "GROUP:MATERIAL"
-            is for one group or shell.
+            is for one group or shell. None: that of the file (.veg), else steel.
         clamp: Regions that do not move, such as "z < 0.01", "group NAME" or "near X Y Z RADIUS", in the unit and the
             axes of the source; None: a free part.
         unit: Of the lengths in the source: "m", "mm", "cm", "um", "in" or "ft"; None: meters.
