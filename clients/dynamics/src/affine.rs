@@ -70,6 +70,11 @@ pub(crate) fn fit_rigid_transform(rest: &[Vector3<f64>], current: &[Vector3<f64>
 /// becomes smaller. A test compares the results with a singular value decomposition.
 const MIN_PAIR_SUM_PRODUCT: f64 = 0.02;
 
+/// The smallest ratio of the second singular value of a correlation matrix to the first one with which it determines a
+/// rotation. Singular values are sums of squared distances, so points count as collinear if their extent in one
+/// direction is more than sqrt(1e9) = 3e4 times the extent in any other direction.
+pub(crate) const MIN_RELATIVE_SPREAD: f64 = 1e-9;
+
 /// The proper rotation nearest to a 3x3 correlation matrix; the identity if two of its singular values vanish.
 pub(crate) fn nearest_rotation(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     closed_form_rotation(correlation).unwrap_or_else(|| rotation_by_svd(correlation))
@@ -119,10 +124,7 @@ fn rotation_by_svd(correlation: &Matrix3<f64>) -> Matrix3<f64> {
     let svd = correlation.svd(compute_u, compute_v);
     let (Some(left), Some(right)) = (svd.u, svd.v_t) else { return Matrix3::identity() };
     let singular_values = svd.singular_values;
-    // Singular values are sums of squared distances, so the limit of their ratio is the square of a ratio of lengths.
-    // Points count as collinear if their extent in one direction is more than sqrt(1e9) = 3e4 times the extent in any
-    // other direction.
-    let has_rank_two = singular_values[0].is_normal() && singular_values[1] > 1e-9 * singular_values[0];
+    let has_rank_two = singular_values[0].is_normal() && singular_values[1] > MIN_RELATIVE_SPREAD * singular_values[0];
     if !has_rank_two {
         return Matrix3::identity();
     }

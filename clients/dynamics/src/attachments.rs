@@ -3,10 +3,11 @@
 //! per mode. A step then costs 12 r multiplications per joint (for each of the r modes, 3 for the mean and 9 for the
 //! correlation) and one `nearest_rotation`, however many attachment vertices the joint has.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Vector3, Vector6};
 use rayon::prelude::*;
 
-use crate::affine::{AffineTransform, nearest_rotation};
+use crate::affine::{AffineTransform, MIN_RELATIVE_SPREAD, nearest_rotation};
+use crate::loads::stack;
 use crate::model::{DomainModel, Joint, MIN_DOMAINS_PER_THREAD, Model, Sample};
 
 /// The attachments of all domains of a model.
@@ -92,6 +93,47 @@ impl AttachmentFit {
         let rotation = nearest_rotation(&correlation);
         AffineTransform { linear: rotation, translation: mean - rotation * self.rest_mean }
     }
+
+    /// Per mode: the derivative of [`Self::rigid_transform`] at rest.
+    ///
+    /// With the correlation C at rest and its change B, the rotation vector w solves (tr(C) I - C) w = b, where b is
+    /// twice the axial vector of B: the sum of the moments of the displacements about the mean.
+    fn rates_at_rest(&self) -> Vec<RigidRate> {
+        let correlation = &self.rest_moments.correlation;
+        let mut spreads: Vec<f64> = correlation.symmetric_eigenvalues().iter().copied().collect();
+        spreads.sort_by(f64::total_cmp);
+        let is_determined = spreads[2].is_normal() && spreads[1] > MIN_RELATIVE_SPREAD * spreads[2];
+        let inverse = (Matrix3::identity() * correlation.trace() - correlation).try_inverse();
+        let inverse = inverse.filter(|_| is_determined).unwrap_or_else(Matrix3::zeros);
+        let rate = |moments: &Moments| {
+            let b = &moments.correlation;
+            let moment = Vector3::new(b[(2, 1)] - b[(1, 2)], b[(0, 2)] - b[(2, 0)], b[(1, 0)] - b[(0, 1)]);
+            RigidRate { center: self.rest_mean, center_velocity: moments.mean, angular_velocity: inverse * moment }
+        };
+        self.mode_moments.iter().map(rate).collect()
+    }
+}
+
+/// The velocity of a rigid body per unit rate of a coordinate.
+struct RigidRate {
+    center: Vector3<f64>,
+    center_velocity: Vector3<f64>,
+    angular_velocity: Vector3<f64>,
+}
+
+/// Per mode of the parent: the small motion of a joint's frame per unit of the coordinate, in world axes at rest: the
+/// translation of the child's origin, then the rotation vector. It is the derivative of the drawn transform of the
+/// child. Empty if the parent's modes do not move the joint.
+pub(crate) fn joint_modes(parent: &DomainModel, joint: &Joint) -> Vec<Vector6<f64>> {
+    let Some(fit) = AttachmentFit::new(parent, joint) else { return vec![] };
+    let origin = &joint.parent_from_child.translation;
+    let (linear, rotation) = (&parent.placement.linear, nearest_rotation(&parent.placement.linear));
+    let world_motion = |rate: RigidRate| {
+        let velocity = linear * (rate.center_velocity + rate.angular_velocity.cross(&(origin - rate.center)));
+        let angular_velocity = rotation * rate.angular_velocity;
+        stack(&velocity, &angular_velocity)
+    };
+    fit.rates_at_rest().into_iter().map(world_motion).collect()
 }
 
 #[cfg(test)]

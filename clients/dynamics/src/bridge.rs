@@ -1,5 +1,6 @@
-//! A bridge under a pulsating load: reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated implicitly.
-//! The other domains of the scene follow at their joints, and their modes with eigenvalues respond to viewers.
+//! A body with reduced forces of a Saint Venant-Kirchhoff (StVK) material, integrated implicitly: a bridge under a
+//! pulsating load, or any body that viewers pull. The other domains of the scene follow at their joints, and their modes
+//! with eigenvalues respond to viewers.
 //!
 //! The load acts on the middle of the bridge, spread evenly over the sampled vertices there. Its strength is calibrated
 //! so that the deflection at equilibrium is a given fraction of the diagonal of the scene's rest bounds. The run starts
@@ -7,7 +8,10 @@
 //!
 //! The load does not act on eigenvectors without stiffness at rest, which it would move away. A bridge whose stiffness
 //! at rest has a negative eigenvalue (a buckled one) is not in equilibrium there: its run starts at rest, and the linear
-//! stiffness calibrates the load.
+//! stiffness calibrates the load. With a deflection of 0 there is no load.
+//!
+//! The damping is that of Vega's settings and, if the domain has the note `damping_ratio`, that of linear modes with this
+//! ratio.
 
 use std::f64::consts::TAU;
 
@@ -22,14 +26,15 @@ use crate::error::{Result, check_option, invalid_input};
 use crate::hierarchy::compose_transforms;
 use crate::implicit::{ImplicitIntegrator, ImplicitMethod, MAX_SUB_STEPS, StepControl};
 use crate::integrator::{Integrator as _, IntegratorTotals, LoadChange, ModalOscillators, MotionState, nyquist_remark};
+use crate::loads::DomainLoads;
 use crate::model::{DomainModel, Model};
-use crate::parameters::ModalParameters;
+use crate::parameters::{ModalParameters, noted_damping_ratio};
 use crate::reduced_system::ReducedSystem;
 use crate::run::{Report, Scenario, aliasing_remark};
 use crate::saved_state::{check_vector, from_json, number_bits, to_json, vector_bits};
 use crate::step_values::StepValues;
 use crate::vega::VegaSettings;
-use crate::viewer_forces::{force_scale, scale_remark};
+use crate::viewer_forces::{MAX_STATIC_DISPLACEMENT, force_scale, scale_remark};
 use crate::viewer_response::{ForcedMotion, ViewerResponse};
 
 /// Largest error of the deflection at equilibrium, as a fraction of the requested deflection.
@@ -38,6 +43,14 @@ const DEFLECTION_TOLERANCE: f64 = 1e-3;
 /// Largest estimated error of the displacement in a step, in diagonals of the scene's rest bounds.
 const STEP_TOLERANCE: f64 = 1e-5;
 
+/// Name of the note with the largest coordinates of the first modes for which the forces were checked: up to them, no load
+/// on one of these modes compresses the material below a stretch of 0.6. `modalcast model --large` writes it.
+const SAFE_COORDINATES_NOTE: &str = "modes.safe_coordinates";
+
+/// Largest static displacement under the forces of viewers, in diagonals of the scene's rest bounds, of a body whose forces
+/// were checked for it. Others have `MAX_STATIC_DISPLACEMENT`.
+const MAX_LARGE_DISPLACEMENT: f64 = 0.5;
+
 /// Settings of the bridge scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BridgeOptions {
@@ -45,7 +58,7 @@ pub struct BridgeOptions {
     pub domain: usize,
     /// Seconds per step.
     pub dt: f64,
-    /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds.
+    /// Deflection at equilibrium as a fraction of the diagonal of the scene's rest bounds. 0: no load.
     pub deflection_fraction: f64,
     /// Period of the load in seconds.
     pub period: f64,
@@ -72,6 +85,8 @@ pub struct BridgeScenario {
     totals: IntegratorTotals,
     options: BridgeOptions,
     settings: VegaSettings,
+    /// Of the domain's note; 0 without it.
+    damping_ratio: f64,
     /// Reduced load U^T f of the force f at the peak of the pulse.
     peak_load: DVector<f64>,
     /// Reduced load of the viewers' forces.
@@ -91,6 +106,12 @@ pub struct BridgeScenario {
     static_deflection_fraction: f64,
     /// Largest displacement so far, in scene units.
     peak_displacement: f64,
+    /// Largest static displacement under the forces of viewers, by the stiffness at rest, in diagonals of the scene's rest
+    /// bounds.
+    static_limit: f64,
+    /// Largest magnitudes of the first coordinates without a remark.
+    safe_coordinates: Vec<f64>,
+    has_compression_remark: bool,
     late_remarks: Vec<String>,
     /// Whether forces of viewers were scaled down.
     has_scaled_forces: bool,
@@ -106,6 +127,7 @@ struct SavedBridge {
     totals: IntegratorTotals,
     #[serde(with = "number_bits")]
     peak_displacement: f64,
+    has_compression_remark: bool,
     late_remarks: Vec<String>,
     has_scaled_forces: bool,
 }
@@ -128,17 +150,11 @@ impl BridgeScenario {
         check_option("period", options.period, f64::MIN_POSITIVE..=1e6)?;
         let rank = force.rank();
         let domain = find_domain(&model, options.domain, rank)?;
-        let system = ReducedSystem::new(force, settings);
-        let unit_load = system.stiff_part(&compute_unit_load(&model, domain, options.load_direction)?);
-        if unit_load.norm() == 0.0 {
-            let given = format!("{rank} modes, and no stiffness at rest against the load");
-            return Err(invalid_input("cubic forces", "a stiffness at rest", given));
-        }
-        let target_deflection = options.deflection_fraction * model.diagonal();
-        let (_, negative_count) = system.unstable_counts();
-        let equilibrium = match negative_count {
-            0 => calibrate_load(&system, domain, &unit_load, target_deflection)?,
-            _ => calibrate_load_at_rest(&system, domain, &unit_load, target_deflection),
+        let damping_ratio = noted_damping_ratio(domain)?.unwrap_or(0.0);
+        let system = ReducedSystem::new(force, settings).with_damping_ratio(damping_ratio);
+        let (unit_load, equilibrium) = match options.deflection_fraction > 0.0 {
+            true => create_load(&system, &model, domain, &options)?,
+            false => (DVector::zeros(rank), LoadedEquilibrium { strength: 0.0, q: DVector::zeros(rank) }),
         };
         let static_deflection = max_sample_displacement(domain, &equilibrium.q);
         let coordinates = domain.first_coordinate..domain.first_coordinate + rank;
@@ -150,6 +166,7 @@ impl BridgeScenario {
             },
         };
         let integrator = ImplicitIntegrator::new(system, options.method, control, options.dt)?;
+        let safe_coordinates = read_safe_coordinates(domain)?;
         let linear_modes = ModalParameters::read_except(&model, Some(options.domain))?;
         let oscillators = ModalOscillators::new(&linear_modes, options.dt)?;
         Ok(Self {
@@ -159,6 +176,7 @@ impl BridgeScenario {
             attachments: Attachments::new(&model),
             options,
             settings: *settings,
+            damping_ratio,
             peak_load: unit_load * equilibrium.strength,
             viewer_load: DVector::zeros(rank),
             state: MotionState::resting(equilibrium.q),
@@ -166,6 +184,12 @@ impl BridgeScenario {
             strength: equilibrium.strength,
             static_deflection_fraction: static_deflection / model.diagonal(),
             peak_displacement: 0.0,
+            static_limit: match safe_coordinates.is_empty() {
+                true => MAX_STATIC_DISPLACEMENT,
+                false => MAX_LARGE_DISPLACEMENT,
+            },
+            safe_coordinates,
+            has_compression_remark: false,
             late_remarks: vec![],
             has_scaled_forces: false,
             totals: IntegratorTotals::default(),
@@ -191,6 +215,20 @@ impl BridgeScenario {
         }
         self.next_step += 1;
         Ok(())
+    }
+
+    /// Adds a remark when a coordinate exceeds its safe range for the first time.
+    fn check_compression(&mut self) {
+        let exceeds = |(q, limit): (&f64, &f64)| q.abs() > *limit;
+        let mode = self.state.q.iter().zip(&self.safe_coordinates).position(exceeds);
+        if let Some(mode) = mode.filter(|_| !self.has_compression_remark) {
+            self.late_remarks.push(format!(
+                "step {}: q[{mode}] = {:.3e} exceeds {:.3e}, up to which loads on this mode compress no point below 0.6 of \
+                 its length; below 0.577 the material loses its stiffness, so that larger shapes may be wrong",
+                self.next_step, self.state.q[mode], self.safe_coordinates[mode]
+            ));
+            self.has_compression_remark = true;
+        }
     }
 
     /// The reduced load at a step.
@@ -221,6 +259,7 @@ impl Scenario for BridgeScenario {
             .with_number("baseFrequency in --config", base_frequency)
             .with_number("dampingMassCoef in --config", damping_mass)
             .with_number("dampingStiffnessCoef in --config", damping_stiffness)
+            .with_number("damping_ratio", self.damping_ratio)
     }
 
     fn save(&self) -> Result<Value> {
@@ -230,6 +269,7 @@ impl Scenario for BridgeScenario {
             viewer_response: self.viewer_response.save(),
             totals: self.totals,
             peak_displacement: self.peak_displacement,
+            has_compression_remark: self.has_compression_remark,
             late_remarks: self.late_remarks.clone(),
             has_scaled_forces: self.has_scaled_forces,
         })
@@ -243,6 +283,7 @@ impl Scenario for BridgeScenario {
         self.viewer_response.restore(saved.viewer_response)?;
         (self.next_step, self.state, self.viewer_load) = (next_step, saved.state, saved.viewer_load);
         (self.totals, self.peak_displacement) = (saved.totals, saved.peak_displacement);
+        self.has_compression_remark = saved.has_compression_remark;
         (self.late_remarks, self.has_scaled_forces) = (saved.late_remarks, saved.has_scaled_forces);
         Ok(())
     }
@@ -259,28 +300,43 @@ impl Scenario for BridgeScenario {
         values.q = q.iter().map(|coordinate| *coordinate as f32).collect();
         values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
         self.peak_displacement = self.peak_displacement.max(self.model.max_displacement(&q, &world_from_domain));
+        self.check_compression();
         self.advance()
     }
 
-    fn set_viewer_forces(&mut self, forces: &[f64]) -> Result<()> {
+    fn set_viewer_forces(&mut self, loads: &DomainLoads) -> Result<()> {
+        let forces = &loads.coordinates;
         let first_coordinate = self.model.domains[self.options.domain].first_coordinate;
         self.viewer_load.copy_from_slice(&forces[first_coordinate..][..self.integrator.system().rank()]);
         let q = self.integrator.system().linear_equilibrium(&self.viewer_load);
         let displacements_per_unit = &self.model.displacements_per_unit()[first_coordinate..];
-        let scale = force_scale(q.as_slice(), displacements_per_unit);
+        // In units of the limit, which `force_scale` has as a share of the diagonal.
+        let limit_share = MAX_STATIC_DISPLACEMENT / self.static_limit;
+        let scale = force_scale((q * limit_share).as_slice(), displacements_per_unit);
         self.viewer_load *= scale;
-        let scale = scale.min(self.viewer_response.set_forces(forces));
+        let linear_scale = self.viewer_response.set_forces(forces);
         if !self.has_scaled_forces {
-            self.late_remarks.extend(scale_remark(scale));
-            self.has_scaled_forces = scale < 1.0;
+            let own_remark = (scale < 1.0).then(|| {
+                format!(
+                    "the forces of viewers would displace the body by {:.3e} diagonals with its stiffness at rest: scaled \
+                     to {}",
+                    self.static_limit / scale,
+                    self.static_limit
+                )
+            });
+            self.late_remarks.extend(own_remark.or_else(|| scale_remark(linear_scale)));
+            self.has_scaled_forces = scale.min(linear_scale) < 1.0;
         }
         Ok(())
     }
 
     fn remarks(&self) -> Vec<String> {
-        let is_damped = self.settings.damping_mass > 0.0 || self.settings.damping_stiffness > 0.0;
+        let VegaSettings { damping_mass, damping_stiffness, .. } = self.settings;
+        let is_damped = [damping_mass, damping_stiffness, self.damping_ratio].into_iter().any(|value| value > 0.0);
         let undamped = (!is_damped).then(|| {
-            "the bridge has no damping, so that vibrations do not decay: set it in the .config file".to_owned()
+            "the bridge has no damping, so that vibrations do not decay: set it in the .config file, or by the note \
+             damping_ratio"
+                .to_owned()
         });
         let system = self.integrator.system();
         let unstable = match system.unstable_counts() {
@@ -295,6 +351,7 @@ impl Scenario for BridgeScenario {
         let modes = modes.map(|(mode, hertz)| (format!("mode {}", mode + 1), hertz));
         let unresolved = nyquist_remark(modes.chain(self.linear_modes.frequencies(&self.model)), self.options.dt);
         let unresolved_load = aliasing_remark("the load", self.options.period, self.options.dt);
+        let unresolved_load = unresolved_load.filter(|_| self.strength > 0.0);
         let remarks = [unresolved_load, undamped, unstable, unresolved];
         let linear_remarks = self.linear_modes.remarks.iter().cloned();
         linear_remarks.chain(remarks.into_iter().flatten()).chain(self.late_remarks.iter().cloned()).collect()
@@ -305,14 +362,18 @@ impl Scenario for BridgeScenario {
     }
 
     fn report(&self) -> Report {
-        let load_description = format!(
-            "a force of {:.4} (in units of mass-normalized modes) on the middle tenth of the bridge, {}, \
+        let has_load = self.strength > 0.0;
+        let load_description = has_load.then(|| {
+            format!(
+                "a force of {:.4} (in units of mass-normalized modes) on the middle tenth of the bridge, {}, \
              pulsating every {} s; the run starts at the equilibrium, with a deflection of {:.4} of the diagonal",
-            self.strength,
-            self.options.load_direction.description(),
-            self.options.period,
-            self.static_deflection_fraction,
-        );
+                self.strength,
+                self.options.load_direction.description(),
+                self.options.period,
+                self.static_deflection_fraction,
+            )
+        });
+        let load_description = load_description.unwrap_or_else(|| "none: the forces of viewers move the body".into());
         let peak_displacement_fraction = self.peak_displacement / self.model.diagonal();
         Report::from_iter([
             ("load".to_owned(), json!(load_description)),
@@ -322,6 +383,17 @@ impl Scenario for BridgeScenario {
             ("integrator".to_owned(), self.totals.to_json()),
         ])
     }
+}
+
+/// The coordinates in the note of a domain; none without the note.
+fn read_safe_coordinates(domain: &DomainModel) -> Result<Vec<f64>> {
+    let Some(text) = domain.notes.get(SAFE_COORDINATES_NOTE) else { return Ok(vec![]) };
+    let number = |word: &str| word.parse().ok().filter(|number: &f64| *number >= 0.0);
+    let numbers: Option<Vec<f64>> = text.split_whitespace().map(number).collect();
+    numbers.filter(|numbers| (1..=domain.rank).contains(&numbers.len())).ok_or_else(|| {
+        let field = format!("{SAFE_COORDINATES_NOTE} of '{}'", domain.name);
+        invalid_input(field, format!("1 to {} numbers >= 0", domain.rank), format!("'{text}'"))
+    })
 }
 
 /// The domain with an index. `rank` is the rank of the forces that act on it.
@@ -386,6 +458,30 @@ fn compute_unit_load(model: &Model, domain: &DomainModel, load_direction: LoadDi
         let given = format!("'{}' with a reduced load of 0", domain.name);
         Err(invalid_input("scene", "a domain whose modes respond to the load", given))
     }
+}
+
+/// A unit load, and the equilibrium at the requested deflection with the strength of the load there.
+///
+/// # Errors
+/// `Invalid` if the load cannot deform the domain, or no stable equilibrium has the deflection.
+fn create_load(
+    system: &ReducedSystem,
+    model: &Model,
+    domain: &DomainModel,
+    options: &BridgeOptions,
+) -> Result<(DVector<f64>, LoadedEquilibrium)> {
+    let unit_load = system.stiff_part(&compute_unit_load(model, domain, options.load_direction)?);
+    if unit_load.norm() == 0.0 {
+        let given = format!("{} modes, and no stiffness at rest against the load", system.rank());
+        return Err(invalid_input("cubic forces", "a stiffness at rest", given));
+    }
+    let target_deflection = options.deflection_fraction * model.diagonal();
+    let (_, negative_count) = system.unstable_counts();
+    let equilibrium = match negative_count {
+        0 => calibrate_load(system, domain, &unit_load, target_deflection)?,
+        _ => calibrate_load_at_rest(system, domain, &unit_load, target_deflection),
+    };
+    Ok((unit_load, equilibrium))
 }
 
 /// The largest displacement of a domain's samples, in scene units.

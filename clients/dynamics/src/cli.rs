@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use modalcast_client::Delivery;
 use modalcast_dynamics::bridge::LoadDirection;
+use modalcast_dynamics::deflection::{VertexForce, VertexName};
 use modalcast_dynamics::implicit::ImplicitMethod;
 use modalcast_dynamics::slow_motion::slow_factor;
 
@@ -15,6 +16,8 @@ Examples:
   modalcast-sim --open simpleBridge --scene bridge --cubic simpleBridge.cub --seconds 4
   modalcast-sim fork --slow 100 --forces --seconds 0 --realtime
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
+  modalcast-sim tree --wind 12 --seconds 60 --realtime
+  modalcast-sim static tree --force trunk:100:0,0,50 --json
   modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint
   modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint --resume tree.checkpoint
 
@@ -22,9 +25,10 @@ Exit codes: 0 done; 1 rejected by the server (unknown scene, or a scene with ano
 3 connection failed or lost; 4 local file error; 5 invalid content of a file, a scene or a reply; 6 done, but the server
 rejected steps; 7 stopped before a step that has no solution, is not finite or is far out of range.";
 
-/// Drives a scene of a modalcast server by the physics that the scene has. Eigenvalues: every mode is integrated
-/// exactly, in a wind if domains are attached to each other (a tree). Cubic forces of the FEM library Vega: implicit
-/// integration, under a pulsating load on the middle (a bridge). Neither: one mode after another is shown; with --forces,
+/// Drives a scene of a modalcast server by the physics that the scene has. Eigenvalues: linear modes; domains that are
+/// attached to each other (a tree) act on each other at their joints, and move in a wind. Cubic forces of large motion:
+/// implicit integration, under a pulsating load on the middle (a bridge of the FEM library Vega) or under the forces of
+/// viewers alone (a model of `modalcast model --large`). Neither: one mode after another is shown; with --forces,
 /// which such a scene cannot follow, this is an error.
 ///
 /// The notes damping_ratio and rigid_modes of a domain set its damping and the number of modes that are held still.
@@ -50,6 +54,26 @@ pub(crate) enum Command {
         #[arg(long = "share", value_name = "SHARE", default_value_t = SWEEP_SHARE, value_parser = parse_fraction)]
         displacement_fraction: f64,
     },
+    /// Computes the displacements of a scene at rest under forces, and sends no steps. Domains that carry the loaded ones
+    /// bend as well.
+    #[command(after_help = EXAMPLES)]
+    Static {
+        #[command(flatten)]
+        server: ServerOptions,
+        /// A force in newtons and world axes at a vertex of a domain, which has a name or an index. Repeat for several
+        /// forces.
+        #[arg(
+            long = "force",
+            value_name = "DOMAIN:VERTEX:FX,FY,FZ",
+            required = true,
+            value_parser = parse_vertex_force,
+            allow_hyphen_values = true
+        )]
+        forces: Vec<VertexForce>,
+        /// A vertex whose displacement is reported, in addition to those with forces. Repeat for several vertices.
+        #[arg(long = "at", value_name = "DOMAIN:VERTEX", value_parser = parse_vertex)]
+        vertices: Vec<VertexName>,
+    },
 }
 
 /// Largest displacement of a sweep as a fraction of the diagonal of the scene's bounds.
@@ -68,8 +92,9 @@ pub(crate) struct PhysicsOptions {
     pub(crate) integration: IntegrationOptions,
 }
 
+/// The server, the scene, and the format of the output.
 #[derive(Debug, Clone, Args)]
-pub(crate) struct CommonOptions {
+pub(crate) struct ServerOptions {
     /// URL of the server: http://HOST:PORT or unix:PATH.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
@@ -85,6 +110,15 @@ pub(crate) struct CommonOptions {
     /// First opens a scene from this source in the server's scene repository, and names it as --scene says.
     #[arg(long, value_name = "SOURCE")]
     pub(crate) open: Option<String>,
+    /// Print a machine-readable summary on standard output.
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(crate) struct CommonOptions {
+    #[command(flatten)]
+    pub(crate) server: ServerOptions,
     /// Simulated time in seconds, with the time before a checkpoint that --resume continues; 0 runs until interrupted.
     #[arg(long, default_value_t = 10.0, value_parser = parse_non_negative)]
     pub(crate) seconds: f64,
@@ -135,9 +169,6 @@ pub(crate) struct CommonOptions {
     /// checkpoints again, add --checkpoint, also with the same file.
     #[arg(long, value_name = "FILE")]
     pub(crate) resume: Option<PathBuf>,
-    /// Print a machine-readable summary on standard output.
-    #[arg(long)]
-    pub(crate) json: bool,
 }
 
 /// Slow motion of a run.
@@ -177,14 +208,12 @@ impl From<DeliveryOption> for Delivery {
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct WindOptions {
-    /// Strength of the wind. At 1, the crown sways by `--sway`. The wind has the spectrum of turbulence 10 m above
-    /// suburbs or forest, and begins with its strongest gust. Default: 1 if domains are attached to each other, else 0.
-    #[arg(long = "wind", value_name = "WIND", value_parser = parse_non_negative)]
-    pub(crate) strength: Option<f64>,
-    /// Peak displacement of the crown in 30 s at wind 1, as a fraction of the scene's height. Shorter runs may not
-    /// reach it.
-    #[arg(long = "sway", value_name = "SWAY", default_value_t = 0.05, value_parser = parse_fraction)]
-    pub(crate) sway_fraction: f64,
+    /// Mean speed of the wind at the crown in m/s: 4 moves leaves and twigs, 8 small branches, 20 breaks branches. The
+    /// drag on all surfaces is proportional to the square of the speed. The wind has the spectrum of turbulence above
+    /// suburbs or forest, and begins with its strongest gust. Default: 0 for a single body; if domains are attached to
+    /// each other, at most 8, and less if its gusts would move a part by more than 0.3 of the height at rest.
+    #[arg(long = "wind", value_name = "SPEED", value_parser = parse_non_negative)]
+    pub(crate) speed: Option<f64>,
     /// Direction that the wind blows to, in degrees about the up axis from x (from y if x is up). At 25, the
     /// default camera sees the sway from the side.
     #[arg(
@@ -202,11 +231,12 @@ pub(crate) struct WindOptions {
 
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ForceFileOptions {
-    /// The file of reduced cubic forces that the FEM library Vega exported.
+    /// The file of reduced cubic forces that `modalcast model --large` or the FEM library Vega wrote.
     #[arg(long, value_name = "FILE.cub")]
     pub(crate) cubic: Option<PathBuf>,
     /// Name or index of the domain that the cubic forces act on. Default: the one whose modes are those of the
-    /// .URendering.float file next to the file of cubic forces.
+    /// .URendering.float file next to the file of cubic forces, or else the one whose note `modes.cubic_sha256` has the
+    /// hash of the file.
     #[arg(long, value_name = "DOMAIN")]
     pub(crate) domain: Option<String>,
     /// Vega's file of frequency scale and damping. Default: the .config file next to the file of cubic forces, if it
@@ -214,16 +244,17 @@ pub(crate) struct ForceFileOptions {
     #[arg(long, value_name = "FILE.config")]
     pub(crate) config: Option<PathBuf>,
     /// Folder with the file of cubic forces. The note `vega.cubic` of the scene has the name of this file. The server
-    /// adds the note to an OBJ model that has a .cub file of the same name.
+    /// adds the note to an OBJ or npz model that has a .cub file of the same name.
     #[arg(long = "files", value_name = "DIR")]
     pub(crate) folder: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, Args)]
 pub(crate) struct LoadOptions {
-    /// Deflection at equilibrium, as a fraction of the diagonal of the scene's bounds.
-    #[arg(long = "deflection", value_name = "DEFLECTION", default_value_t = 0.03, value_parser = parse_fraction)]
-    pub(crate) deflection_fraction: f64,
+    /// Deflection at equilibrium, as a fraction of the diagonal of the scene's bounds. 0: no load. Default: 0 if the
+    /// domain has eigenvalues, as models of `modalcast model --large` have, else 0.03.
+    #[arg(long = "deflection", value_name = "DEFLECTION", value_parser = parse_fraction)]
+    pub(crate) deflection_fraction: Option<f64>,
     /// Period of the load in seconds.
     #[arg(long, default_value_t = 2.0, value_parser = parse_positive)]
     pub(crate) period: f64,
@@ -279,17 +310,27 @@ impl Cli {
     pub(crate) const fn common(&self) -> &CommonOptions {
         match &self.command {
             Some(Command::Sweep { common, .. }) => common,
-            None => &self.common,
+            Some(Command::Static { .. }) | None => &self.common,
+        }
+    }
+
+    /// The server, the scene, and the format of the output.
+    pub(crate) const fn server(&self) -> &ServerOptions {
+        match &self.command {
+            Some(Command::Static { server, .. }) => server,
+            Some(Command::Sweep { .. }) | None => &self.common().server,
         }
     }
 }
 
-impl CommonOptions {
+impl ServerOptions {
     /// The scene's name on the server.
     pub(crate) fn scene(&self) -> &str {
         self.positional_scene.as_deref().unwrap_or(&self.scene)
     }
+}
 
+impl CommonOptions {
     /// The times of a run of a scene whose lowest frequency in hertz is known, or unknown.
     pub(crate) fn timing(&self, lowest_frequency: Option<f64>) -> Timing {
         let slow = match self.slow {
@@ -310,6 +351,21 @@ impl CommonOptions {
 fn parse_non_negative(text: &str) -> Result<f64, String> {
     let number = text.parse().ok().filter(|number| (0.0..=1e6).contains(number));
     number.ok_or_else(|| "expected a number from 0 to 1000000".into())
+}
+
+fn parse_vertex(text: &str) -> Result<VertexName, String> {
+    // The name of a domain may have colons.
+    let (domain, vertex) = text.rsplit_once(':').ok_or("expected DOMAIN:VERTEX")?;
+    let vertex = vertex.parse().map_err(|_| format!("expected the index of a vertex, got '{vertex}'"))?;
+    Ok(VertexName { domain: domain.to_owned(), vertex })
+}
+
+fn parse_vertex_force(text: &str) -> Result<VertexForce, String> {
+    let (vertex, force) = text.rsplit_once(':').ok_or("expected DOMAIN:VERTEX:FX,FY,FZ")?;
+    let numbers: Vec<f64> = force.split(',').filter_map(|number| number.trim().parse().ok()).collect();
+    let force = <[f64; 3]>::try_from(numbers).ok().filter(|force| force.iter().all(|number| number.abs() <= 1e30));
+    let force = force.ok_or("expected three numbers FX,FY,FZ of at most 1e30")?;
+    Ok(VertexForce { vertex: parse_vertex(vertex)?, force })
 }
 
 fn parse_degrees(text: &str) -> Result<f64, String> {
@@ -351,15 +407,26 @@ mod tests {
         let cli = parse(&["fork", "--slow", "100", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
         let common = cli.common();
         let timing = Timing { dt: 0.005, slow: 100.0, steps: Some(400) };
-        assert_eq!((common.scene(), common.timing(Some(5000.0))), ("fork", timing));
+        assert_eq!((common.server.scene(), common.timing(Some(5000.0))), ("fork", timing));
         let sweep = parse(&["sweep", "fork", "--dt", "0.5", "--seconds", "2"]).expect("valid arguments");
-        assert_eq!((sweep.common().scene(), sweep.common().timing(None).steps), ("fork", Some(4)));
-        assert_eq!(parse(&[]).expect("valid arguments").common().scene(), "tree");
+        assert_eq!((sweep.server().scene(), sweep.common().timing(None).steps), ("fork", Some(4)));
+        assert_eq!(parse(&[]).expect("valid arguments").server().scene(), "tree");
         let auto = parse(&["--slow", "auto", "--dt", "0.5", "--steps", "9"]).expect("valid arguments");
         assert_eq!(auto.common().timing(Some(206.0)), Timing { dt: 0.005, slow: 100.0, steps: Some(9) });
         assert_eq!(auto.common().timing(None), Timing { dt: 0.5, slow: 1.0, steps: Some(9) });
         for invalid in [&["fork", "--scene", "tree"][..], &["--slow", "0"], &["--slow", "nan"]] {
             assert!(parse(invalid).is_err(), "{invalid:?}");
+        }
+    }
+
+    #[test]
+    fn forces_at_vertices_are_parsed_from_the_end() {
+        let vertex = VertexName { domain: "limb: 3".into(), vertex: 7 };
+        assert_eq!(parse_vertex("limb: 3:7"), Ok(vertex.clone()));
+        assert_eq!(parse_vertex_force("limb: 3:7:0,-1.5,2e-2"), Ok(VertexForce { vertex, force: [0.0, -1.5, 0.02] }));
+        for text in ["limb:7", "limb:7:1,2", "limb:7:1,2,x", "limb:7:1,2,nan", "limb:-7:1,2,3", "7:1,2,3", "1,2,3", ""]
+        {
+            assert!(parse_vertex_force(text).is_err(), "{text}");
         }
     }
 

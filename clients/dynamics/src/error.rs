@@ -14,7 +14,10 @@ pub enum Error {
     #[error("{field}: expected {expected}, got {given}")]
     Invalid { field: String, expected: String, given: String },
     /// The motion is not finite or far out of range. `subject` is a coordinate or a transform.
-    #[error("step {step} ({time} s): {subject} diverged: expected {expected}, got {given}")]
+    #[error(
+        "step {step} ({time} s): {subject} diverged: expected {expected}, got {given}: choose a weaker load (--wind, \
+         --deflection) or smaller steps (--dt)"
+    )]
     Diverged { step: u64, time: f64, subject: String, expected: String, given: String },
     /// The equations of a step have no solution that the integrator finds. `residual` is relative to the largest force.
     #[error(

@@ -1,5 +1,6 @@
 //! A physics process that drives a modalcast server. It computes reduced coordinates q and transforms T of every step
-//! from the server's description of the scene and, for a Vega model, from its files of reduced forces.
+//! from the server's description of the scene and, for large motion, from a file of reduced forces: that of a model of
+//! `modalcast model --large`, or of the library Vega.
 //!
 //! | module | what it does |
 //! |---|---|
@@ -11,8 +12,11 @@
 //! | `parameters` | reads and validates eigenvalues and damping ratios |
 //! | `rigid_modes` | finds the modes without stiffness, which are held still |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
+//! | `loads` | forces on the coordinates of domains, and wrenches on their frames |
+//! | `coupled` | domains that act on each other at joints: equations of motion, integrator, static response |
+//! | `deflection` | displacements of a scene at rest under forces at vertices |
 //! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
-//! | `tree` | a tree in the wind, by modal superposition |
+//! | `tree` | linear modes in the wind and under forces of viewers: a tree, or a single body |
 //! | `cubic` | reduced forces of a St. Venant-Kirchhoff material from a `.cub` file, with Jacobian and potential |
 //! | `vega` | base frequency and damping from a `.config` file, and the hash of U in a `.URendering.float` file |
 //! | `force_domain` | finds the domain that a file of reduced forces belongs to |
@@ -20,7 +24,7 @@
 //! | `newton` | Newton's method with a line search |
 //! | `integrator` | the trait of integrators, their reports, and the exact integrator of linear modes |
 //! | `implicit` | implicit integrators of cubic forces, with sub-steps by an estimate of the error |
-//! | `bridge` | a bridge with cubic forces under a pulsating load, and linear modes of the other domains |
+//! | `bridge` | a body with cubic forces, under a pulsating load (a bridge) or pulled by viewers, and linear modes of the other domains |
 //! | `sweep` | motion for any scene: moves one coordinate after another, or rocks a rigid scene |
 //! | `viewer_forces` | reads the forces that viewers apply |
 //! | `viewer_response` | the response of linear modes to the forces of viewers |
@@ -71,13 +75,16 @@ pub mod attachments;
 pub mod bridge;
 pub mod checkpoint;
 mod connected_parts;
+pub mod coupled;
 pub mod cubic;
+pub mod deflection;
 pub mod divergence;
 mod error;
 pub mod force_domain;
 pub mod hierarchy;
 pub mod implicit;
 pub mod integrator;
+pub mod loads;
 pub mod model;
 mod newton;
 pub mod oscillator;

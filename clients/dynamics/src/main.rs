@@ -12,18 +12,19 @@ use modalcast_client::{Client, program};
 use modalcast_dynamics::bridge::{BridgeOptions, BridgeScenario};
 use modalcast_dynamics::checkpoint::CheckpointOptions;
 use modalcast_dynamics::cubic::ReducedForce;
-use modalcast_dynamics::force_domain::find_force_domain;
+use modalcast_dynamics::deflection::report_deflections;
+use modalcast_dynamics::force_domain::{check_forces_belong, find_force_domain};
 use modalcast_dynamics::model::Model;
 use modalcast_dynamics::parameters::ModalParameters;
 use modalcast_dynamics::reduced_system::ReducedSystem;
 use modalcast_dynamics::run::{Report, RunOptions, RunSummary, Scenario, drive_scene};
 use modalcast_dynamics::sweep::{SweepOptions, SweepScenario};
-use modalcast_dynamics::tree::{TreeOptions, TreeScenario};
+use modalcast_dynamics::tree::{TreeOptions, TreeScenario, default_wind_speed};
 use modalcast_dynamics::vega::VegaSettings;
 use modalcast_dynamics::{Error, Result, invalid_input};
 use tokio::sync::watch;
 
-use cli::{Cli, Command, ForceFileOptions, PhysicsOptions, SWEEP_SHARE, SlowMotion, Timing};
+use cli::{Cli, Command, ForceFileOptions, PhysicsOptions, SWEEP_SHARE, ServerOptions, SlowMotion, Timing};
 
 /// Maximum number of surface samples per domain of a tree. A tree may have thousands of domains, and the rows of U of
 /// every sample are fetched from the server.
@@ -31,6 +32,9 @@ const MAX_TREE_SAMPLES: usize = 24;
 
 /// Maximum number of surface samples per domain of other scenes, which usually have few domains.
 const MAX_SAMPLES: usize = 1 << 16;
+
+/// Deflection of a bridge under its load, as a fraction of the diagonal of the scene's rest bounds.
+const DEFAULT_DEFLECTION: f64 = 0.03;
 
 /// Maximum number of files that a remark names.
 const MAX_NAMED_FILES: usize = 8;
@@ -41,8 +45,15 @@ const EXIT_STEPS_REJECTED: u8 = 6;
 fn main() -> ExitCode {
     let arguments = Cli::parse();
     let main = async {
-        let summary = run_scenario(&arguments).await?;
-        print_report(&summary.report, arguments.common().json);
+        let client = connect(arguments.server()).await?;
+        let scene = open_scene(&client, arguments.server()).await?;
+        if let Some(Command::Static { forces, vertices, .. }) = &arguments.command {
+            let model = Model::fetch(&client, &scene, MAX_TREE_SAMPLES).await?;
+            print_report(&report_deflections(&client, &model, forces, vertices).await?, arguments.server().json);
+            return Ok(0);
+        }
+        let summary = run_scenario(&client, scene, &arguments).await?;
+        print_report(&summary.report, arguments.server().json);
         Ok(if summary.rejected_steps > 0 { EXIT_STEPS_REJECTED } else { 0 })
     };
     program::run("modalcast-sim", main, exit_code)
@@ -57,14 +68,21 @@ const fn exit_code(error: &Error) -> u8 {
     }
 }
 
-async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
+async fn connect(options: &ServerOptions) -> Result<Client> {
+    Ok(Client::connect_with_retry(&options.server, Duration::from_secs_f64(options.wait)).await?)
+}
+
+/// Opens the scene if the options say so, and returns its name.
+async fn open_scene(client: &Client, options: &ServerOptions) -> Result<String> {
+    match &options.open {
+        Some(source) => Ok(client.open_scene(source, options.scene()).await?.scene),
+        None => Ok(options.scene().to_owned()),
+    }
+}
+
+async fn run_scenario(client: &Client, scene: String, arguments: &Cli) -> Result<RunSummary> {
     let common = arguments.common();
-    let client = Client::connect_with_retry(&common.server, Duration::from_secs_f64(common.wait)).await?;
-    let scene = match &common.open {
-        Some(source) => client.open_scene(source, common.scene()).await?.scene,
-        None => common.scene().to_owned(),
-    };
-    let TimedScenario { mut scenario, timing } = create_scenario(&client, &scene, arguments).await?;
+    let TimedScenario { mut scenario, timing } = create_scenario(client, &scene, arguments).await?;
     for remark in scenario.remarks() {
         eprintln!("modalcast-sim: {scene}: {remark}");
     }
@@ -93,7 +111,7 @@ async fn run_scenario(arguments: &Cli) -> Result<RunSummary> {
             .map(|path| CheckpointOptions { path, interval: common.checkpoint_interval }),
         resume_path: common.resume.clone(),
     };
-    drive_scene(&client, scenario.as_mut(), &options, &stop_receiver).await
+    drive_scene(client, scenario.as_mut(), &options, &stop_receiver).await
 }
 
 /// Waits for Ctrl-C or SIGTERM.
@@ -130,21 +148,19 @@ async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Resul
     let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
     let announce = |motion: &str| eprintln!("modalcast-sim: {scene}: {motion}");
     if let Some(force_path) = find_force_file(&model, files)? {
-        announce("cubic forces under a pulsating load");
         return create_bridge_scenario(client, scene, arguments, &force_path).await;
     }
     if let Some(remark) = unused_force_files(files) {
         announce(&remark);
     }
-    let wind_strength = match wind.strength {
-        Some(strength) => Some(strength),
-        None if is_tree(&model) => Some(1.0),
-        None => None,
+    let wind_speed = match wind.speed {
+        None if is_tree(&model) => Some(default_wind_speed(&model, wind.direction_degrees.to_radians())?),
+        speed => speed,
     };
-    match wind_strength {
-        Some(wind_strength) => {
-            announce(&format!("modes in wind {wind_strength}"));
-            create_tree_scenario(model, arguments, wind_strength)
+    match wind_speed {
+        Some(wind_speed) => {
+            announce(&format!("modes in a wind of {wind_speed} m/s"));
+            create_tree_scenario(model, arguments, wind_speed)
         }
         None if common.forces => {
             check_forces_move(&model)?;
@@ -158,13 +174,12 @@ async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Resul
     }
 }
 
-fn create_tree_scenario(model: Model, arguments: &Cli, wind_strength: f64) -> Result<TimedScenario> {
+fn create_tree_scenario(model: Model, arguments: &Cli, wind_speed: f64) -> Result<TimedScenario> {
     let timing = choose_timing(&model.scene, arguments, ModalParameters::read(&model)?.lowest_frequency());
     let wind = &arguments.physics.wind;
     let options = TreeOptions {
         dt: timing.dt,
-        sway_fraction: wind.sway_fraction,
-        wind_strength,
+        wind_speed,
         direction_radians: wind.direction_degrees.to_radians(),
         seed: wind.seed,
     };
@@ -226,15 +241,25 @@ async fn create_bridge_scenario(
     let default_config = force_path.with_extension("config");
     let config_path = files.config.clone().or_else(|| default_config.is_file().then_some(default_config));
     let settings = config_path.map_or_else(|| Ok(VegaSettings::default()), |path| VegaSettings::read(&path))?;
-    let force = ReducedForce::read(force_path)?;
-    let domain = find_force_domain(client, scene, files.domain.as_deref(), force_path).await?;
+    let force_bytes = std::fs::read(force_path).map_err(|error| modalcast_client::Error::file(force_path, error))?;
+    let domain = find_force_domain(client, scene, files.domain.as_deref(), force_path, &force_bytes).await?;
+    if let Some(domain) = model.domains.get(domain) {
+        check_forces_belong(domain, &force_bytes)?;
+    }
+    let force = ReducedForce::parse(&force_bytes)?;
     let linear_frequency = ModalParameters::read_except(&model, Some(domain))?.lowest_frequency();
     let frequencies = [linear_frequency, ReducedSystem::new(force.clone(), &settings).lowest_frequency()];
     let timing = choose_timing(scene, arguments, frequencies.into_iter().flatten().min_by(f64::total_cmp));
+    // A model with eigenvalues is a part to pull; Vega's models have none.
+    let has_eigenvalues = model.domains.get(domain).is_some_and(|domain| !domain.eigenvalues.is_empty());
+    let default_deflection = if has_eigenvalues { 0.0 } else { DEFAULT_DEFLECTION };
+    let deflection_fraction = load.deflection_fraction.unwrap_or(default_deflection);
+    let load_name = if deflection_fraction > 0.0 { "a pulsating load" } else { "the forces of viewers" };
+    eprintln!("modalcast-sim: {scene}: cubic forces under {load_name}");
     let options = BridgeOptions {
         domain,
         dt: timing.dt,
-        deflection_fraction: load.deflection_fraction,
+        deflection_fraction,
         period: load.period,
         load_direction: load.direction.into(),
         method: integration.method.into(),

@@ -5,8 +5,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use modalcast_client::{Client, Domain, ModeRows, SceneDescription, Shape, ShapeArray};
-use nalgebra::Vector3;
+use modalcast_client::{Client, Domain, Inertia, ModeRows, SceneDescription, Shape, ShapeArray};
+use nalgebra::{DMatrix, Matrix3, Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
 use crate::affine::AffineTransform;
@@ -52,6 +52,18 @@ pub struct FollowedDomain {
     pub leader_from_follower: AffineTransform,
 }
 
+/// The mass properties of a domain's own material, about the domain's origin and along its axes at rest. Lengths are in
+/// scene units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DomainInertia {
+    /// R^T M R, where R are the six rigid motions: translations along the axes, then rotations about them.
+    pub rigid: Matrix6<f64>,
+    /// R^T M U: per mode, the momentum and the angular momentum per unit rate of the coordinate.
+    pub coupling: Vec<Vector6<f64>>,
+    /// U^T M U, r x r.
+    pub modal: DMatrix<f64>,
+}
+
 /// One domain of the scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct DomainModel {
@@ -71,6 +83,8 @@ pub struct DomainModel {
     pub follow: Option<FollowedDomain>,
     /// (rad/s)^2 per mode; empty when unknown.
     pub eigenvalues: Vec<f64>,
+    /// `None` if unknown.
+    pub inertia: Option<DomainInertia>,
     /// Free-form metadata of the scene's author, by name.
     pub notes: BTreeMap<String, String>,
     /// Surface area; 0 if the mesh was not requested.
@@ -94,6 +108,8 @@ pub struct Model {
     pub domains: Vec<DomainModel>,
     /// Number of coordinates of all domains.
     pub coordinate_count: usize,
+    /// Meters per scene unit.
+    pub unit: f64,
     /// Unit vector of the up axis.
     pub up: Vector3<f64>,
     /// Corners of the bounds at rest.
@@ -107,6 +123,27 @@ pub struct GroundAxes {
     /// The axis along which the bounds are longer.
     pub long_axis: Vector3<f64>,
     pub short_axis: Vector3<f64>,
+}
+
+impl DomainInertia {
+    /// The mass properties of a domain of r modes. `inertia` has 6 r momenta and r^2 masses.
+    pub(crate) fn new(rank: usize, inertia: &Inertia) -> Self {
+        let Inertia { mass, center, moments: [xx, yy, zz, xy, xz, yz], modal_momenta, modal_masses } = inertia;
+        // A motion has the momentum m (v + w x c), and the angular momentum m c x v + J w.
+        let moment = (Vector3::from(*center) * *mass).cross_matrix();
+        let mut rigid = Matrix6::zeros();
+        rigid.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(*mass);
+        rigid.fixed_view_mut::<3, 3>(0, 3).copy_from(&-moment);
+        rigid.fixed_view_mut::<3, 3>(3, 0).copy_from(&moment);
+        let tensor = Matrix3::new(*xx, *xy, *xz, *xy, *yy, *yz, *xz, *yz, *zz);
+        rigid.fixed_view_mut::<3, 3>(3, 3).copy_from(&tensor);
+        let momentum = |mode: usize| Vector6::from_fn(|row, _| modal_momenta[row * rank + mode]);
+        Self {
+            rigid,
+            coupling: (0..rank).map(momentum).collect(),
+            modal: DMatrix::from_row_slice(rank, rank, modal_masses),
+        }
+    }
 }
 
 impl Sample {
@@ -135,6 +172,12 @@ impl DomainModel {
     /// The coordinates of this domain, from the coordinates of the whole scene.
     pub fn q<'a>(&self, scene_q: &'a [f64]) -> &'a [f64] {
         &scene_q[self.first_coordinate..][..self.rank]
+    }
+
+    /// The domain that this one follows or is attached to. `None` for a root.
+    pub fn carrier(&self) -> Option<usize> {
+        let followed = self.follow.as_ref().map(|follow| follow.leader);
+        followed.or_else(|| self.joint.as_ref().map(|joint| joint.parent))
     }
 
     /// The samples that are spread evenly over the vertices.
@@ -256,7 +299,11 @@ impl Model {
         if !(diagonal.is_finite() && diagonal > 0.0) {
             return Err(invalid_input("scene.bounds", "finite bounds with a positive diagonal", diagonal));
         }
-        Ok(Self { scene: info.scene.clone(), domains, coordinate_count, up, bounds_min, bounds_max })
+        let (scene, unit) = (info.scene.clone(), info.unit);
+        if !(unit.is_finite() && unit > 0.0) {
+            return Err(invalid_input("scene.unit", "a positive number of meters", unit));
+        }
+        Ok(Self { scene, domains, coordinate_count, unit, up, bounds_min, bounds_max })
     }
 
     /// Diagonal of the bounds at rest, in scene units.
@@ -351,7 +398,7 @@ fn base_vertex(shape: &Shape) -> u32 {
     (0..shape.vertex_count as u32).min_by(|a, b| norm_squared(*a).total_cmp(&norm_squared(*b))).unwrap_or(0)
 }
 
-fn rest_position(shape: &Shape, vertex: u32) -> Vector3<f64> {
+pub(crate) fn rest_position(shape: &Shape, vertex: u32) -> Vector3<f64> {
     let local_position = &shape.local_positions()[3 * vertex as usize..];
     Vector3::from_fn(|component, _| shape.origin[component] + f64::from(local_position[component]))
 }
@@ -396,6 +443,7 @@ fn create_domain_model(
         joint: None,
         follow: None,
         eigenvalues: domain.eigenvalues.clone(),
+        inertia: domain.inertia.as_ref().map(|inertia| DomainInertia::new(domain.rank, inertia)),
         notes: domain.notes.clone(),
         area: surface_area(shape),
         part_count: 0,

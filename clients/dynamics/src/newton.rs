@@ -16,13 +16,14 @@ const ARMIJO_CONSTANT: f64 = 1e-4;
 const ROUNDING_TOLERANCE: f64 = 1e-13;
 
 /// The last increment relative to the unknown of a converged solve. Newton's method converges quadratically, so that
-/// the error after an increment of 1e-9 is at the precision of f64.
+/// the error after an increment of 1e-9 is at the precision of f64. The last increment is always added, because Newton's
+/// method approaches a solution from one side, so that the remainders of many steps would add up.
 const CONVERGENCE_TOLERANCE: f64 = 1e-9;
 
 /// An increment below this value, relative to the unknown, is close to the solution.
 const LOCAL_INCREMENT: f64 = 1e-3;
 
-/// A residual below this value cannot be reduced further.
+/// A residual below this value is a rounding error, which a line search would not reduce.
 const RESIDUAL_PRECISION: f64 = 1e-15;
 
 /// An objective to minimize.
@@ -64,10 +65,10 @@ impl ProblemEvaluation {
 pub(crate) fn solve(problem: &dyn NewtonProblem, initial_guess: &DVector<f64>) -> Solution {
     let mut unknown = initial_guess.clone();
     let mut current = problem.evaluate(&unknown);
-    let (mut hessian, mut iterations, mut relative_increment) = (None, 0, f64::INFINITY);
+    let (mut hessian, mut iterations, mut is_converged) = (None, 0, false);
     loop {
         let residual = current.residual();
-        let is_converged = relative_increment <= CONVERGENCE_TOLERANCE || residual <= RESIDUAL_PRECISION;
+        is_converged |= residual == 0.0;
         let solution =
             |unknown, hessian, is_converged| Solution { unknown, iterations, residual, is_converged, hessian };
         if is_converged || iterations == MAX_ITERATIONS || !residual.is_finite() {
@@ -79,14 +80,18 @@ pub(crate) fn solve(problem: &dyn NewtonProblem, initial_guess: &DVector<f64>) -
         let direction = -cholesky.solve(&current.gradient);
         hessian = Some(cholesky);
         // The increment of a shifted Hessian says nothing about the distance to the solution.
-        let relative_norm = direction.norm() / unknown.norm().max(f64::MIN_POSITIVE);
-        let increment = if is_shifted { f64::INFINITY } else { relative_norm };
-        let is_local = increment <= LOCAL_INCREMENT;
+        let increment = direction.norm() / unknown.norm().max(f64::MIN_POSITIVE);
+        let is_last = increment <= CONVERGENCE_TOLERANCE || residual <= RESIDUAL_PRECISION;
+        if is_last && !is_shifted {
+            unknown += direction;
+            current = problem.evaluate(&unknown);
+            (is_converged, iterations) = (true, iterations + 1);
+            continue;
+        }
+        let is_local = increment <= LOCAL_INCREMENT && !is_shifted;
         let Some((next_unknown, next)) = search_line(problem, &unknown, &current, &direction, is_local) else {
-            // Only rounding errors are left after a small increment.
-            return solution(unknown, hessian, increment <= CONVERGENCE_TOLERANCE);
+            return solution(unknown, hessian, false);
         };
-        relative_increment = increment;
         (unknown, current) = (next_unknown, next);
         iterations += 1;
     }

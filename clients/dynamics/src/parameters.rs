@@ -118,9 +118,17 @@ fn rounded_frequency(eigenvalue: f64) -> f64 {
 }
 
 fn read_damping_ratio(domain: &DomainModel) -> Result<f64> {
-    let Some(text) = domain.notes.get("damping_ratio") else { return Ok(DEFAULT_DAMPING_RATIO) };
+    Ok(noted_damping_ratio(domain)?.unwrap_or(DEFAULT_DAMPING_RATIO))
+}
+
+/// The damping ratio in the note of a domain; `None` without the note.
+///
+/// # Errors
+/// `Invalid` if the note is not a number from 0 to 1000.
+pub(crate) fn noted_damping_ratio(domain: &DomainModel) -> Result<Option<f64>> {
+    let Some(text) = domain.notes.get("damping_ratio") else { return Ok(None) };
     let number = text.trim().parse().ok().filter(|ratio| (0.0..=MAX_DAMPING_RATIO).contains(ratio));
-    number.ok_or_else(|| {
+    number.map(Some).ok_or_else(|| {
         let field = format!("damping_ratio of '{}'", domain.name);
         invalid_input(field, format!("a number from 0 to {MAX_DAMPING_RATIO}"), format!("'{text}'"))
     })

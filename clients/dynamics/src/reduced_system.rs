@@ -17,7 +17,7 @@ pub struct ReducedSystem {
     force: ReducedForce,
     /// s, the square of Vega's base frequency.
     scale: f64,
-    /// D = mass coefficient * I + stiffness coefficient * scaled stiffness at rest; r x r.
+    /// D = mass coefficient * I + stiffness coefficient * scaled stiffness at rest + modal damping; r x r.
     damping: DMatrix<f64>,
     /// Eigenvalues of the scaled stiffness at rest in (rad/s)^2, lowest first.
     eigenvalues: Vec<f64>,
@@ -47,6 +47,16 @@ impl ReducedSystem {
         let identity = DMatrix::identity(force.rank(), force.rank());
         let damping = identity * settings.damping_mass + damping_stiffness * settings.damping_stiffness;
         Self { force, scale, damping, eigenvalues, eigenvectors }
+    }
+
+    /// Adds modal damping: each eigenvector of the stiffness at rest gets this fraction of its critical damping. One
+    /// without positive stiffness gets none.
+    #[must_use]
+    pub fn with_damping_ratio(mut self, ratio: f64) -> Self {
+        let coefficients = self.eigenvalues.iter().map(|eigenvalue| 2.0 * ratio * eigenvalue.max(0.0).sqrt());
+        let coefficients = DMatrix::from_diagonal(&DVector::from_iterator(self.rank(), coefficients));
+        self.damping += &self.eigenvectors * coefficients * self.eigenvectors.transpose();
+        self
     }
 
     /// The number of coordinates r.
@@ -198,6 +208,19 @@ mod tests {
         let load = DVector::from_column_slice(&[5.0, 10.0, 15.0]);
         assert!((system.linear_equilibrium(&load) - DVector::from_column_slice(&[1.0, 2.0, 3.0])).norm() <= 1e-12);
         assert!((system.stiff_part(&load) - DVector::from_column_slice(&[5.0, 0.0, 0.0])).norm() <= 1e-12);
+    }
+
+    #[test]
+    fn modal_damping_is_a_fraction_of_the_critical_one() {
+        // The force of coupled springs, so that the eigenvectors are no axes.
+        let coupled = ReducedForce::new(2, &[50.0, -20.0, -20.0, 80.0], &[0.0; 6], &[0.0; 8]).expect("a valid force");
+        let system = ReducedSystem::new(coupled, &VegaSettings::default()).with_damping_ratio(0.25);
+        // D^2 = (2 * 0.25)^2 K.
+        let difference = system.damping() * system.damping() - system.force().rest_stiffness() * 0.25;
+        assert!(difference.norm() <= 1e-12, "{difference}");
+        let unstable = ReducedSystem::new(spring_chain(&[5.0, -2.0, 0.0], 0.0, 0.0), &VegaSettings::default());
+        let eigenvalues = unstable.with_damping_ratio(0.1).damping().clone().symmetric_eigenvalues();
+        assert!((eigenvalues.max() - 0.2 * 5.0_f64.sqrt()).abs() <= 1e-12 && eigenvalues.min() >= -1e-15);
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::cubic::tests::spring_chain;
 use crate::error::Result;
 use crate::hierarchy::tests::four_domain_model;
 use crate::implicit::ImplicitMethod;
+use crate::loads::DomainLoads;
 use crate::run::Scenario;
 use crate::step_values::StepValues;
 use crate::sweep::{SweepOptions, SweepScenario};
@@ -19,8 +20,7 @@ const STEPS: u64 = 150;
 /// The first step, the steps around a change of the forces, and others.
 const CUTS: [u64; 7] = [0, 1, 39, 40, 41, 77, STEPS];
 
-const TREE: TreeOptions =
-    TreeOptions { dt: 1.0 / 60.0, sway_fraction: 0.05, wind_strength: 1.0, direction_radians: 0.4, seed: 7 };
+const TREE: TreeOptions = TreeOptions { dt: 1.0 / 60.0, wind_speed: 8.0, direction_radians: 0.4, seed: 7 };
 
 const BRIDGE: BridgeOptions = BridgeOptions {
     domain: 0,
@@ -68,25 +68,19 @@ const MOTIONS: [Motion; 8] = [
         name: "tree in wind",
         create: || tree(TREE),
         viewer_forces: None,
-        numbers: &[
-            "/response/state/q/0",
-            "/response/state/v/1",
-            "/response/forces/2",
-            "/response/pressures/3/downwind",
-            "/response/pressures/3/crosswind",
-        ],
+        numbers: &["/motion/state/q/0", "/motion/state/v/1", "/motion/forces/2"],
     },
     Motion {
         name: "tree in wind and forces of viewers",
         create: || tree(TREE),
         viewer_forces: Some([[0.0, 0.0, 2.0, 0.0, 0.0, -1.0], [1.0; 6]]),
-        numbers: &["/response/state/q/0", "/viewer_response/state/q/2", "/viewer_response/state/v/5"],
+        numbers: &["/motion/state/q/0", "/motion/state/q/2", "/motion/viewer_forces/5"],
     },
     Motion {
         name: "modes under forces of viewers",
-        create: || tree(TreeOptions { wind_strength: 0.0, ..TREE }),
+        create: || tree(TreeOptions { wind_speed: 0.0, ..TREE }),
         viewer_forces: Some([[3.0, 0.0, 2.0, 0.0, 0.0, -1.0], [1e30; 6]]),
-        numbers: &["/viewer_response/state/q/0", "/viewer_response/state/v/2", "/viewer_response/forces/5"],
+        numbers: &["/motion/state/q/0", "/motion/state/v/2", "/motion/viewer_forces/5"],
     },
     Motion {
         name: "bridge",
@@ -123,7 +117,8 @@ impl Motion {
             {
                 let is_new = step == 40 || step == 100 || (gets_forces && step == first_step);
                 let forces = if step < 100 { first } else { second };
-                is_new.then(|| scenario.set_viewer_forces(forces).expect("a scenario with forces"));
+                let loads = DomainLoads::of_coordinates(scenario.model(), forces);
+                is_new.then(|| scenario.set_viewer_forces(&loads).expect("a scenario with forces"));
             }
             let mut values = StepValues::default();
             scenario.compute_next_step(&mut values).expect("the next step");
@@ -218,19 +213,20 @@ fn states_of_other_scenarios_are_rejected() {
     };
     let not_finite = || Value::from(f64::NAN.to_bits());
     for (motion, state, names) in [
-        (&MOTIONS[1], &tree_state, &["/response/state", "/viewer_response/state", "/response", "/viewer_response"][..]),
-        (&MOTIONS[4], &bridge_state, &["/state", "/viewer_response/state", "", "/viewer_response"]),
+        (
+            &MOTIONS[1],
+            &tree_state,
+            ["/motion/state/q", "/motion/state/v", "/motion/forces", "/motion/viewer_forces"].as_slice(),
+        ),
+        (&MOTIONS[4], &bridge_state, &["/state/q", "/viewer_response/state/v", "/viewer_response/forces"]),
     ] {
-        let vectors = [format!("{}/q", names[0]), format!("{}/v", names[1]), format!("{}/forces", names[3])];
-        for vector in vectors {
-            let given = error(motion, &alter(state, &vector, Value::Array(vec![])));
+        for vector in names {
+            let given = error(motion, &alter(state, vector, Value::Array(vec![])));
             assert!(given.starts_with("state.") && given.ends_with("got 0"), "{given}");
             let given = error(motion, &alter(state, &format!("{vector}/1"), not_finite()));
             assert!(given.ends_with("expected a finite number, got NaN"), "{given}");
         }
     }
-    let given = error(&MOTIONS[1], &alter(&tree_state, "/response/pressures", Value::Array(vec![])));
-    assert_eq!(given, "state.pressures: expected 4 domains, got 0");
     let given = error(&MOTIONS[4], &alter(&bridge_state, "/viewer_load", Value::Array(vec![])));
     assert_eq!(given, "state.viewer_load: expected 2 numbers, got 0");
 }

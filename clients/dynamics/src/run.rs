@@ -14,6 +14,7 @@ use tokio::sync::watch;
 use crate::checkpoint::{Checkpoint, CheckpointOptions, RunIdentity};
 use crate::divergence::DivergenceCheck;
 use crate::error::{Error, Result, invalid_input};
+use crate::loads::DomainLoads;
 use crate::model::Model;
 use crate::recorder::Recorder;
 use crate::step_values::{StepValues, add_changes};
@@ -54,12 +55,11 @@ pub trait Scenario {
     /// `Invalid` if the state is not that of this scenario.
     fn restore(&mut self, next_step: u64, state: Value) -> Result<()>;
 
-    /// Sets the forces of viewers, which act in all later steps in addition to the load of the scenario: one number per
-    /// coordinate of the scene.
+    /// Sets the forces of viewers, which act in all later steps in addition to the load of the scenario.
     ///
     /// # Errors
     /// `Invalid` if the motion of the scenario does not follow from forces.
-    fn set_viewer_forces(&mut self, _forces: &[f64]) -> Result<()> {
+    fn set_viewer_forces(&mut self, _loads: &DomainLoads) -> Result<()> {
         Err(invalid_input("--forces", "a motion that follows from forces", "a sweep"))
     }
 
@@ -289,9 +289,9 @@ impl<'a> Driver<'a> {
         }
         // After the pause, so that a force that arrives during the pause acts in this step.
         if let Some(viewer_forces) = &mut self.viewer_forces
-            && let Some(forces) = viewer_forces.take_changed(self.scenario.model()).await?
+            && let Some(loads) = viewer_forces.take_changed(self.scenario.model()).await?
         {
-            self.scenario.set_viewer_forces(&forces)?;
+            self.scenario.set_viewer_forces(&loads)?;
         }
         self.scenario.compute_next_step(&mut self.current_values)?;
         let late_remarks = self.scenario.late_remarks();

@@ -12,6 +12,7 @@ use crate::error::Error;
 use crate::hierarchy::tests::four_domain_model;
 use crate::implicit::{ImplicitIntegrator, ImplicitMethod, StepControl};
 use crate::integrator::{Integrator as _, LoadChange, MotionState};
+use crate::loads::DomainLoads;
 use crate::oscillator::{ModeState, Oscillator};
 use crate::reduced_system::ReducedSystem;
 use crate::run::Scenario as _;
@@ -129,11 +130,11 @@ fn tree_sends_only_steps_in_range() {
                 domain.eigenvalues = eigenvalues(case).to_vec();
                 domain.notes.insert("damping_ratio".into(), case.damping_ratio.to_string());
             }
-            let options =
-                TreeOptions { dt: case.dt, sway_fraction: 0.05, wind_strength: 1.0, direction_radians: 0.4, seed: 7 };
+            let options = TreeOptions { dt: case.dt, wind_speed: 0.1, direction_radians: 0.4, seed: 7 };
             let mut tree = TreeScenario::new(model, options).expect("a valid scenario");
             let check = DivergenceCheck::new(tree.model());
-            tree.set_viewer_forces(&[viewer_force; 6]).expect("a scenario with forces");
+            let loads = DomainLoads::of_coordinates(tree.model(), &[viewer_force; 6]);
+            tree.set_viewer_forces(&loads).expect("a scenario with forces");
             let mut values = StepValues::default();
             let mut send_step = |step: u64| {
                 tree.compute_next_step(&mut values)?;

@@ -9,8 +9,8 @@ use crate::model::Model;
 use crate::saved_state::{check_vector, vector_bits};
 use crate::viewer_forces::force_scale;
 
-/// The response of every mode to the forces of viewers. The modes are linear, so this response is added to the response
-/// to the wind. The gains of the wind do not scale it. A force acts on one domain only: joints do not transmit it to the parent.
+/// The response of every mode to the forces of viewers on its coordinate: joints do not transmit the forces to other
+/// domains.
 pub(crate) struct ViewerResponse {
     current: ForcedMotion,
     /// Per coordinate: [`Model::displacements_per_unit`].

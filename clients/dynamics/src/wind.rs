@@ -1,6 +1,6 @@
 //! Wind pressure by time and position: a mean wind with turbulence of von Karman's spectrum. The wind is a sum of
 //! cosines with random frequencies and phases (Shinozuka and Deodatis 1991), so that it is a function of time and of a
-//! seed.
+//! seed. Speeds are in meters per second, and pressures in pascals: 1/2 rho |v| v.
 //!
 //! With the frequency n, the length scale L, the mean speed V and the standard deviation sigma of a gust speed, the
 //! spectra S of the gust speeds along and across the wind are (von Karman 1948, in the form of ESDU 85020)
@@ -14,8 +14,9 @@
 //! their normalized cross-spectrum is exp(-10 n d / V) (Davenport 1961), with one typical distance d for all pairs of
 //! domains. Slow gusts therefore move a tree as a whole, and fast ones each leaf on its own.
 //!
-//! The mean speed is that of a strong breeze. Turbulence intensity and length scale are those of EN 1991-1-4 (4.4 and
-//! annex B) 10 m above ground, between the terrain categories III and IV: suburbs or forest, and cities.
+//! The mean speed is the same at all heights: that at the crown. Turbulence intensity and length scale are those of EN
+//! 1991-1-4 (4.4 and annex B) 10 m above ground, between the terrain categories III and IV: suburbs or forest, and
+//! cities.
 
 use std::f64::consts::{PI, TAU};
 
@@ -25,8 +26,8 @@ use serde::{Deserialize, Serialize};
 use crate::model::MIN_DOMAINS_PER_THREAD;
 use crate::saved_state::number_bits;
 
-/// V, in m/s.
-const MEAN_SPEED: f64 = 12.0;
+/// rho, the density of air at 15 degrees Celsius and sea level (ICAO standard atmosphere), in kg/m^3.
+const AIR_DENSITY: f64 = 1.225;
 
 /// L, in meters.
 const LENGTH_SCALE: f64 = 40.0;
@@ -39,13 +40,6 @@ const CROSSWIND_RATIO: f64 = 0.75;
 
 /// Factor in the exponent of the coherence.
 const COHERENCE_DECAY: f64 = 10.0;
-
-/// d, the distance that the coherence assumes between any two domains, in meters.
-const DOMAIN_DISTANCE: f64 = 2.0;
-
-/// Diagonal in meters that every scene is assumed to have, for the travel time of gusts, because scenes have any unit of
-/// length. It is the diagonal of a tree of 8 m.
-const SCENE_DIAGONAL: f64 = 10.0;
 
 /// Lowest and highest frequency in hertz. The range contains the first modes of trunks (about 0.5 Hz) and of leaves (3
 /// to 7 Hz).
@@ -77,7 +71,7 @@ enum Component {
     Crosswind,
 }
 
-/// Pressure relative to the pressure of the mean wind, along the two horizontal directions of a wind.
+/// Pressure in pascals along the two horizontal directions of a wind.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct WindPressure {
     #[serde(with = "number_bits")]
@@ -98,8 +92,10 @@ struct GustSpeed {
 pub struct WindSettings {
     /// Seed of all frequencies and phases.
     pub seed: u64,
-    /// Diagonal of the scene's bounds, in scene units. It must be positive.
-    pub diagonal: f64,
+    /// V, in m/s; 0 for calm air.
+    pub mean_speed: f64,
+    /// d, the typical distance between two domains, in meters.
+    pub domain_distance: f64,
     /// Highest frequency of the wind in hertz. Frequencies that a run does not resolve are left out: they would appear
     /// as slower gusts that the spectrum does not contain.
     pub max_frequency: f64,
@@ -117,6 +113,8 @@ struct Cosine {
 /// A wind that blows in one horizontal direction.
 #[derive(Debug, Clone)]
 pub struct Wind {
+    /// The pressure of the mean wind in pascals.
+    mean_pressure: f64,
     cosines: Vec<Cosine>,
     /// The argument of the cosines when the wind starts, in seconds.
     start_time: f64,
@@ -129,25 +127,23 @@ pub struct Wind {
 }
 
 impl Wind {
-    /// Creates a wind on domains at the given positions along the wind (scene units).
+    /// Creates a wind on domains at the given positions along the wind, in meters.
     pub fn new(settings: &WindSettings, downwind_positions: &[f64]) -> Self {
-        let cosines: Vec<Cosine> = create_cosines(settings.seed)
-            .into_iter()
-            .filter(|cosine| cosine.frequency <= settings.max_frequency)
-            .collect();
+        let is_resolved = |cosine: &Cosine| settings.mean_speed > 0.0 && cosine.frequency <= settings.max_frequency;
+        let cosines: Vec<Cosine> = create_cosines(settings).into_iter().filter(is_resolved).collect();
         let coefficient_count = (2 * cosines.len()).next_multiple_of(LANES);
-        let seconds_per_length = SCENE_DIAGONAL / MEAN_SPEED / settings.diagonal;
         let coefficients = downwind_positions.par_iter().enumerate().flat_map_iter(|(domain, position)| {
-            let delay = seconds_per_length * position;
-            let downwind = coefficients(&cosines, settings.seed, Component::Downwind, domain, delay);
-            let crosswind = coefficients(&cosines, settings.seed, Component::Crosswind, domain, delay);
+            let delay = position / settings.mean_speed;
+            let downwind = coefficients(&cosines, settings, Component::Downwind, domain, delay);
+            let crosswind = coefficients(&cosines, settings, Component::Crosswind, domain, delay);
             [downwind, crosswind].into_iter().flat_map(move |mut factors| {
                 factors.resize(coefficient_count, 0.0);
                 factors
             })
         });
         Self {
-            start_time: find_start_time(&cosines, settings.seed),
+            mean_pressure: 0.5 * AIR_DENSITY * settings.mean_speed.powi(2),
+            start_time: find_start_time(&cosines, settings),
             coefficients: coefficients.collect(),
             coefficient_count,
             domain_count: downwind_positions.len(),
@@ -155,20 +151,26 @@ impl Wind {
         }
     }
 
+    /// The pressure in pascals of the gusts of a wind with a mean speed in m/s: the peak velocity pressure of EN 1991-1-4,
+    /// equation 4.8, with a peak factor of 3.5.
+    pub fn gust_pressure(mean_speed: f64) -> f64 {
+        (1.0 + 7.0 * TURBULENCE_INTENSITY) * 0.5 * AIR_DENSITY * mean_speed.powi(2)
+    }
+
     /// The highest frequency of all winds, in hertz.
     pub const fn highest_frequency() -> f64 {
         FREQUENCY_RANGE[1]
     }
 
-    /// The pressure on every domain `time` seconds after the start of the wind. It is 0 at time 0. The drag of a body
-    /// is proportional to the speed times the velocity of the wind.
+    /// The pressure on every domain `time` seconds after the start of the wind: 1/2 rho |v| v with the velocity v of the
+    /// wind. It is 0 at time 0.
     pub fn pressures(&self, time: f64) -> Vec<WindPressure> {
-        let onset_factor = smoothstep(time / RISE_TIME);
+        let pressure_scale = self.mean_pressure * smoothstep(time / RISE_TIME);
         let pressure = |gust: GustSpeed| {
             let speed = (1.0 + gust.downwind).hypot(gust.crosswind);
             WindPressure {
-                downwind: onset_factor * speed * (1.0 + gust.downwind),
-                crosswind: onset_factor * speed * gust.crosswind,
+                downwind: pressure_scale * speed * (1.0 + gust.downwind),
+                crosswind: pressure_scale * speed * gust.crosswind,
             }
         };
         self.gust_speeds(time).map(pressure).collect()
@@ -191,10 +193,11 @@ impl Wind {
 
 /// The frequencies of all winds of a seed, in bands of equal ratio. Each is random in its band, so that the sum does
 /// not repeat. The amplitudes have the energy of the spectrum in the band.
-fn create_cosines(seed: u64) -> Vec<Cosine> {
+fn create_cosines(settings: &WindSettings) -> Vec<Cosine> {
+    let WindSettings { seed, mean_speed, .. } = *settings;
     let cosine = |index: usize| {
         let (low, high) = (band_edge(index), band_edge(index + 1));
-        let amplitude = |component| (2.0 * integrate_spectrum(component, low, high)).sqrt();
+        let amplitude = |component| (2.0 * integrate_spectrum(component, mean_speed, low, high)).sqrt();
         Cosine {
             frequency: low * (high / low).powf(hash_to_unit(seed, u64::MAX - index as u64)),
             amplitudes: [amplitude(Component::Downwind), amplitude(Component::Crosswind)],
@@ -210,14 +213,14 @@ fn band_edge(index: usize) -> f64 {
 }
 
 /// The spectrum n S(n) of a gust speed relative to the mean speed, at `frequency` hertz: see the module documentation.
-fn spectrum(component: Component, frequency: f64) -> f64 {
+fn spectrum(component: Component, mean_speed: f64, frequency: f64) -> f64 {
     match component {
         Component::Downwind => {
-            let x = frequency * LENGTH_SCALE / MEAN_SPEED;
+            let x = frequency * LENGTH_SCALE / mean_speed;
             TURBULENCE_INTENSITY.powi(2) * 4.0 * x / (1.0 + 70.8 * x * x).powf(5.0 / 6.0)
         }
         Component::Crosswind => {
-            let x = frequency * 0.5 * LENGTH_SCALE / MEAN_SPEED;
+            let x = frequency * 0.5 * LENGTH_SCALE / mean_speed;
             (CROSSWIND_RATIO * TURBULENCE_INTENSITY).powi(2) * 4.0 * x * (1.0 + 755.2 * x * x)
                 / (1.0 + 283.2 * x * x).powf(11.0 / 6.0)
         }
@@ -225,22 +228,29 @@ fn spectrum(component: Component, frequency: f64) -> f64 {
 }
 
 /// The variance of a gust speed between two frequencies: the integral of n S(n) over ln n, by Simpson's rule.
-fn integrate_spectrum(component: Component, low: f64, high: f64) -> f64 {
-    let middle = (low * high).sqrt();
-    let sum = spectrum(component, low) + 4.0 * spectrum(component, middle) + spectrum(component, high);
+fn integrate_spectrum(component: Component, mean_speed: f64, low: f64, high: f64) -> f64 {
+    let value = |frequency: f64| spectrum(component, mean_speed, frequency);
+    let sum = value(low) + 4.0 * value((low * high).sqrt()) + value(high);
     sum * (high / low).ln() / 6.0
 }
 
 /// Magnitude of the normalized cross-spectrum of two domains.
-fn coherence(frequency: f64) -> f64 {
-    (-COHERENCE_DECAY * frequency * DOMAIN_DISTANCE / MEAN_SPEED).exp()
+fn coherence(settings: &WindSettings, frequency: f64) -> f64 {
+    (-COHERENCE_DECAY * frequency * settings.domain_distance / settings.mean_speed).exp()
 }
 
 /// The factors of the cosines, then of the sines, of a gust speed. A domain has its own gusts and those of the whole
 /// scene, which arrive `delay` seconds later than at the position 0. Their energies add up to that of the spectrum.
-fn coefficients(cosines: &[Cosine], seed: u64, component: Component, domain: usize, delay: f64) -> Vec<f32> {
+fn coefficients(
+    cosines: &[Cosine],
+    settings: &WindSettings,
+    component: Component,
+    domain: usize,
+    delay: f64,
+) -> Vec<f32> {
+    let seed = settings.seed;
     let phasor = |(index, cosine): (usize, &Cosine)| {
-        let coherence = coherence(cosine.frequency);
+        let coherence = coherence(settings, cosine.frequency);
         let scene_angle = scene_phase(seed, component, index) - TAU * (cosine.frequency * delay).fract();
         let counter = ((domain as u64 + 1) * 2 + component as u64) * COSINE_COUNT as u64 + index as u64;
         let own_angle = TAU * hash_to_unit(seed, counter);
@@ -263,14 +273,16 @@ fn scene_phase(seed: u64, component: Component, index: usize) -> f64 {
 
 /// Finds the start of the wind, `GUST_TIME` before its strongest gust. A short run then shows a gust, and the wind does
 /// not become much stronger later.
-fn find_start_time(cosines: &[Cosine], seed: u64) -> f64 {
+fn find_start_time(cosines: &[Cosine], settings: &WindSettings) -> f64 {
     let amplitude = |cosine: &Cosine| {
         // The mean of a cosine over a duration d has the amplitude sin(pi n d) / (pi n d).
         let angle = PI * cosine.frequency * GUST_DURATION;
-        cosine.amplitudes[Component::Downwind as usize] * coherence(cosine.frequency).sqrt() * angle.sin() / angle
+        cosine.amplitudes[Component::Downwind as usize] * coherence(settings, cosine.frequency).sqrt() * angle.sin()
+            / angle
     };
     let amplitudes: Vec<f64> = cosines.iter().map(amplitude).collect();
-    let phases: Vec<f64> = (0..cosines.len()).map(|index| scene_phase(seed, Component::Downwind, index)).collect();
+    let phases: Vec<f64> =
+        (0..cosines.len()).map(|index| scene_phase(settings.seed, Component::Downwind, index)).collect();
     let mean_gust = |time: f64| -> f64 {
         let terms = cosines.iter().zip(&amplitudes).zip(&phases);
         terms.map(|((cosine, amplitude), phase)| amplitude * (TAU * cosine.frequency * time + phase).cos()).sum()
@@ -301,7 +313,7 @@ fn smoothstep(x: f64) -> f64 {
 }
 
 /// Hashes a seed and a counter to a pseudorandom number in [0, 1), with the finalizer of splitmix64.
-fn hash_to_unit(seed: u64, counter: u64) -> f64 {
+pub(crate) fn hash_to_unit(seed: u64, counter: u64) -> f64 {
     let mut x = seed.wrapping_add(counter.wrapping_mul(0x9e37_79b9_7f4a_7c15)).wrapping_add(0x9e37_79b9_7f4a_7c15);
     x = (x ^ (x >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     x = (x ^ (x >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -1,6 +1,7 @@
 use super::*;
 use crate::cubic::tests::{data_folder, spring_chain};
 use crate::divergence::DivergenceCheck;
+use crate::error::Error;
 use crate::hierarchy::tests::four_domain_model;
 use crate::model::Sample;
 
@@ -90,12 +91,67 @@ fn remarks_name_unresolved_load_and_missing_damping() {
     assert_eq!(remarks(1.0 / 60.0, 2.0, 0.01), [""; 0]);
 }
 
+/// A body without a load of its own, which a viewer pulls and releases.
+#[test]
+fn body_without_load_moves_by_viewers_and_decays_by_its_damping_ratio() {
+    let swing = |damping_ratio: &str| {
+        let mut model = four_domain_model();
+        model.domains[0].notes.insert("damping_ratio".into(), damping_ratio.into());
+        let options = BridgeOptions { deflection_fraction: 0.0, ..OPTIONS };
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        let body = BridgeScenario::new(model, force, &VegaSettings::default(), options);
+        let (mut body, mut values) = (body.expect("a valid scenario"), StepValues::default());
+        body.compute_next_step(&mut values).expect("the first step");
+        assert_eq!(values.q, [0.0; 6], "expected no motion without forces");
+        body.set_viewer_forces(&DomainLoads::of_coordinates(body.model(), &[5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            .expect("a scenario with forces");
+        (0..20).for_each(|_| body.compute_next_step(&mut values).expect("the next step"));
+        assert!(values.q[0] > 1e-2, "{:?}", values.q);
+        body.set_viewer_forces(&DomainLoads::of_coordinates(body.model(), &[0.0; 6])).expect("a scenario with forces");
+        body.compute_next_step(&mut values).expect("the next step");
+        let start = body.integrator.system().energy(&body.state);
+        (0..300).for_each(|_| body.compute_next_step(&mut values).expect("the next step"));
+        (body.integrator.system().energy(&body.state) / start, body.remarks())
+    };
+    let (kept, undamped_remarks) = swing("0");
+    assert!((kept - 1.0).abs() <= 1e-6 && undamped_remarks.iter().any(|text| text.contains("no damping")), "{kept}");
+    let (decayed, remarks) = swing("0.05");
+    // exp(-2 * 0.05 * 6.3 rad/s * 5 s) = 0.04.
+    assert!((0.005..0.2).contains(&decayed) && remarks.is_empty(), "{decayed} {remarks:?}");
+}
+
+#[test]
+fn coordinate_beyond_its_safe_range_is_one_remark() {
+    let remarks = |limits: &str| {
+        let mut model = four_domain_model();
+        model.domains[0].notes.insert(SAFE_COORDINATES_NOTE.into(), limits.into());
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        let settings = VegaSettings { damping_stiffness: 0.01, ..VegaSettings::default() };
+        let mut bridge = BridgeScenario::new(model, force, &settings, OPTIONS)?;
+        let start = bridge.state.q.clone();
+        let mut values = StepValues::default();
+        (0..100).for_each(|_| bridge.compute_next_step(&mut values).expect("the next step"));
+        Ok::<_, Error>((bridge.late_remarks().to_vec(), start))
+    };
+    let (none, start) = remarks("1e3 1e3").expect("valid limits");
+    assert_eq!(none, [""; 0]);
+    let (beyond, _) = remarks(&format!("1e3 {:e}", 0.5 * start[1].abs())).expect("valid limits");
+    assert!(beyond.len() == 1 && beyond[0].contains("q[1]") && beyond[0].contains("loses its stiffness"), "{beyond:?}");
+    for invalid in ["-1", "", "x 1", "1 1 1", "nan"] {
+        let error = remarks(invalid).expect_err("an invalid note").to_string();
+        assert!(error.contains("modes.safe_coordinates of 'beam'"), "{invalid}: {error}");
+    }
+}
+
 #[test]
 fn viewer_forces_change_the_motion() {
     let run = |forces: Option<[f64; 6]>| {
         let (mut bridge, mut values) = (two_mode_bridge(), StepValues::default());
         for _ in 0..20 {
-            forces.iter().for_each(|forces| bridge.set_viewer_forces(forces).expect("a scenario with forces"));
+            if let Some(forces) = &forces {
+                let loads = DomainLoads::of_coordinates(bridge.model(), forces);
+                bridge.set_viewer_forces(&loads).expect("a scenario with forces");
+            }
             bridge.compute_next_step(&mut values).expect("the next step");
         }
         values.q
@@ -115,15 +171,39 @@ fn viewer_forces_change_the_motion() {
 fn enormous_viewer_forces_do_not_end_the_run() {
     let (mut bridge, mut values) = (two_mode_bridge(), StepValues::default());
     let check = DivergenceCheck::new(&bridge.model);
-    bridge.set_viewer_forces(&[32.0 * f64::from(f32::MAX); 6]).expect("a scenario with forces");
+    let loads = |force: f64| DomainLoads::of_coordinates(&four_domain_model(), &[force; 6]);
+    bridge.set_viewer_forces(&loads(32.0 * f64::from(f32::MAX))).expect("a scenario with forces");
     assert!(bridge.viewer_load.norm() > 0.0, "expected an effect");
-    bridge.set_viewer_forces(&[1e30; 6]).expect("a scenario with forces");
+    bridge.set_viewer_forces(&loads(1e30)).expect("a scenario with forces");
     let remarks = bridge.late_remarks();
     assert!(remarks.len() == 1 && remarks[0].contains("scaled to 0.25"), "{remarks:?}");
     for step in 0..600 {
         bridge.compute_next_step(&mut values).expect("the next step");
         check.check(&bridge.model, step, 0.0, &values).expect("a bounded motion");
     }
+}
+
+/// A body whose forces were checked for large displacements follows stronger pulls.
+#[test]
+fn checked_body_is_pulled_further() {
+    let load = |is_checked: bool| {
+        let mut model = four_domain_model();
+        if is_checked {
+            model.domains[0].notes.insert(SAFE_COORDINATES_NOTE.into(), "1".into());
+        }
+        let force = spring_chain(&[40.0, 90.0], 30.0, 4.0);
+        let body = BridgeScenario::new(model, force, &VegaSettings::default(), OPTIONS);
+        let mut body = body.expect("a valid scenario");
+        body.set_viewer_forces(&DomainLoads::of_coordinates(body.model(), &[1e6, 0.0, 0.0, 0.0, 0.0, 0.0]))
+            .expect("a scenario with forces");
+        (body.viewer_load.norm(), body.late_remarks().concat())
+    };
+    let ((usual, remark), (checked, checked_remark)) = (load(false), load(true));
+    assert!(
+        remark.ends_with("scaled to 0.25") && checked_remark.ends_with("scaled to 0.5"),
+        "{remark} {checked_remark}"
+    );
+    assert!((checked / usual - 2.0).abs() <= 1e-9, "{checked} and {usual}");
 }
 
 /// Very short steps, and steps that are longer than all periods.

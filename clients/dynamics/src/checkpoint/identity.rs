@@ -9,7 +9,10 @@ use sha2::{Digest as _, Sha256};
 
 use crate::affine::AffineTransform;
 use crate::error::{Result, invalid_input};
-use crate::model::{DomainModel, FollowedDomain, Joint, Model, Sample};
+use crate::model::{DomainInertia, DomainModel, FollowedDomain, Joint, Model, Sample};
+
+/// Name of the input that is the hash of the scene.
+const SCENE_HASH: &str = "scene (SHA-256)";
 
 /// The inputs that the motion of a run follows from, as text by name.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -32,7 +35,7 @@ impl RunIdentity {
     /// Adds the hash of a scene.
     #[must_use]
     pub(crate) fn with_scene(self, model: &Model) -> Self {
-        self.with("scene (SHA-256)", hash_scene(model))
+        self.with(SCENE_HASH, hash_scene(model))
     }
 
     /// Checks that a checkpoint with the identity `self` at `path` belongs to a run with the identity `run`.
@@ -40,10 +43,10 @@ impl RunIdentity {
     /// # Errors
     /// `Invalid` with the first input that differs, and its two values.
     pub(crate) fn check(&self, run: &Self, path: &Path) -> Result<()> {
-        // The kind of motion decides which other inputs there are.
+        // The kind of motion decides which other inputs there are, and the scene their defaults.
         let names: BTreeSet<&str> = self.0.keys().chain(run.0.keys()).map(String::as_str).collect();
         let mut names: Vec<&str> = names.into_iter().collect();
-        names.sort_by_key(|name| *name != "motion");
+        names.sort_by_key(|name| (*name != "motion", *name != SCENE_HASH));
         let value = |identity: &Self, name: &str| identity.0.get(name).map_or("none", String::as_str).to_owned();
         match names.into_iter().find(|name| self.0.get(*name) != run.0.get(*name)) {
             None => Ok(()),
@@ -62,9 +65,10 @@ pub(crate) fn hexadecimal(bytes: &[u8]) -> String {
 
 /// The SHA-256 of everything in a model but the names of the scene and its domains; 64 hexadecimal digits.
 fn hash_scene(model: &Model) -> String {
-    let Model { scene: _, domains, coordinate_count, up, bounds_min, bounds_max } = model;
+    let Model { scene: _, domains, coordinate_count, unit, up, bounds_min, bounds_max } = model;
     let mut hasher = ModelHasher(Sha256::new());
     hasher.add_counts(&[domains.len(), *coordinate_count]);
+    hasher.add_numbers(&[*unit]);
     [up, bounds_min, bounds_max].into_iter().for_each(|vector| hasher.add_numbers(vector.as_slice()));
     domains.iter().for_each(|domain| hasher.add_domain(domain));
     hexadecimal(&hasher.0.finalize())
@@ -100,6 +104,7 @@ impl ModelHasher {
             joint,
             follow,
             eigenvalues,
+            inertia,
             notes,
             area,
             part_count,
@@ -129,6 +134,12 @@ impl ModelHasher {
             self.add_transform(leader_from_follower);
         }
         self.add_numbers(eigenvalues);
+        self.add_counts(&[usize::from(inertia.is_some())]);
+        if let Some(DomainInertia { rigid, coupling, modal }) = inertia {
+            self.add_numbers(rigid.as_slice());
+            coupling.iter().for_each(|momentum| self.add_numbers(momentum.as_slice()));
+            self.add_numbers(modal.as_slice());
+        }
         self.add_numbers(&[*area, *diagonal]);
         self.add_counts(&[notes.len()]);
         for text in notes.iter().flat_map(|(name, text)| [name, text]) {

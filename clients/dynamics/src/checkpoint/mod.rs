@@ -30,7 +30,7 @@ pub(crate) use identity::hexadecimal;
 
 /// The version of the format. A change of the state of a scenario, or of an integrator whose steps then have other
 /// bits, needs a new one: a file of another version is rejected.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// The start of every file.
 const MAGIC: &str = "modalcast-sim checkpoint ";
@@ -41,8 +41,8 @@ const MAX_HEADER_BYTES: u64 = 160;
 /// Maximum size of the JSON without its numbers.
 const MAX_TEXT_BYTES: u64 = 1 << 20;
 
-/// Maximum size of the numbers of a coordinate or a domain. A tree, which has most, needs q, v and a force for the wind
-/// and for viewers: seven numbers of at most 21 bytes.
+/// Maximum size of the numbers of a coordinate or a domain. A tree, which has most, needs q, v, a force and
+/// a force of viewers: four numbers of at most 21 bytes.
 const MAX_BYTES_PER_COORDINATE: u64 = 256;
 
 /// The largest number of a step. The times of later steps are not exact.

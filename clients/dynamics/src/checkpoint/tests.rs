@@ -74,9 +74,9 @@ fn files_of_another_kind_are_rejected_from_their_first_bytes() {
 
 #[test]
 fn files_of_another_version_size_or_content_are_rejected() {
-    let other_version = String::from_utf8(written_bytes()).expect("text").replacen("checkpoint 1 ", "checkpoint 2 ", 1);
+    let other_version = String::from_utf8(written_bytes()).expect("text").replacen("checkpoint 2 ", "checkpoint 3 ", 1);
     let error = read_bytes(other_version.as_bytes()).expect_err("another version");
-    assert!(error.ends_with("expected a checkpoint of version 1, got version 2"), "{error}");
+    assert!(error.ends_with("expected a checkpoint of version 2, got version 3"), "{error}");
     let valid = serde_json::to_string(&checkpoint(7)).expect("JSON");
     read_bytes(&file_of(&valid)).expect("control");
     for (json, expected) in [

@@ -1,6 +1,12 @@
 use super::*;
 
-const SETTINGS: WindSettings = WindSettings { seed: 7, diagonal: 10.0, max_frequency: f64::INFINITY };
+const SPEED: f64 = 12.0;
+
+const SETTINGS: WindSettings =
+    WindSettings { seed: 7, mean_speed: SPEED, domain_distance: 2.0, max_frequency: f64::INFINITY };
+
+/// The pressure of the mean wind, in pascals.
+const MEAN_PRESSURE: f64 = 0.5 * AIR_DENSITY * SPEED * SPEED;
 
 /// A sum of five cosines for negative controls: periods in seconds and amplitudes. It has no energy above 2 Hz, and two
 /// of its frequencies are close to those of modes of the built-in tree's trunk.
@@ -60,7 +66,8 @@ fn check_energy(signals: &[Vec<f64>], component: Component) -> Result<(), String
     for range in 1..COSINE_COUNT / 8 {
         let (low, high) = (band_edge(8 * range), band_edge(8 * range + 8));
         let bands = 8 * range..8 * range + 8;
-        let expected: f64 = bands.map(|band| integrate_spectrum(component, band_edge(band), band_edge(band + 1))).sum();
+        let expected: f64 =
+            bands.map(|band| integrate_spectrum(component, SPEED, band_edge(band), band_edge(band + 1))).sum();
         let variances = periodograms.iter().map(|periodogram| variance_between(periodogram, low, high));
         let ratio = variances.sum::<f64>() / signals.len() as f64 / expected;
         if !(0.75..=1.25).contains(&ratio) {
@@ -95,16 +102,18 @@ fn gusts_have_the_energy_of_the_spectrum_at_all_frequencies() {
 fn spectra_are_normalized_and_isotropic_at_high_frequencies() {
     let integral = |component| -> f64 {
         let edge = |index: u32| 1e-7 * 10.0_f64.powf(f64::from(index) / 200.0);
-        (0..2400).map(|index| integrate_spectrum(component, edge(index), edge(index + 1))).sum()
+        (0..2400).map(|index| integrate_spectrum(component, SPEED, edge(index), edge(index + 1))).sum()
     };
     let expected = TURBULENCE_INTENSITY.powi(2);
     assert!((integral(Component::Downwind) / expected - 1.0).abs() < 2e-3);
     assert!((integral(Component::Crosswind) / (expected * CROSSWIND_RATIO.powi(2)) - 1.0).abs() < 2e-3);
     // In the inertial range of isotropic turbulence, the lateral spectrum is 4/3 of the longitudinal one, and both
     // decrease with n^(-5/3) (Kolmogorov 1941). `spectrum` is n S(n).
-    let ratio = spectrum(Component::Crosswind, 1e4) / spectrum(Component::Downwind, 1e4) / CROSSWIND_RATIO.powi(2);
+    let ratio = spectrum(Component::Crosswind, SPEED, 1e4)
+        / spectrum(Component::Downwind, SPEED, 1e4)
+        / CROSSWIND_RATIO.powi(2);
     assert!((ratio - 4.0 / 3.0).abs() < 2e-3, "{ratio}");
-    let slope = (spectrum(Component::Downwind, 2e4) / spectrum(Component::Downwind, 1e4)).log2();
+    let slope = (spectrum(Component::Downwind, SPEED, 2e4) / spectrum(Component::Downwind, SPEED, 1e4)).log2();
     assert!((slope + 2.0 / 3.0).abs() < 1e-3, "{slope}");
 }
 
@@ -134,8 +143,10 @@ fn response_changes_smoothly_with_the_frequency_of_a_mode() {
         windows.map(ratio).fold(0.0, f64::max)
     };
     for seed in 0..8 {
-        let cosines: Vec<(f64, f64)> =
-            create_cosines(seed).iter().map(|cosine| (cosine.frequency, cosine.amplitudes[0])).collect();
+        let cosines: Vec<(f64, f64)> = create_cosines(&WindSettings { seed, ..SETTINGS })
+            .iter()
+            .map(|cosine| (cosine.frequency, cosine.amplitudes[0]))
+            .collect();
         assert!(largest_change(&cosines) < 1.6, "seed {seed}: {}", largest_change(&cosines));
     }
     let five_gusts = FIVE_GUSTS.map(|(period, amplitude)| (1.0 / period, amplitude));
@@ -180,7 +191,7 @@ fn run_begins_with_a_strong_gust() {
         let wind = Wind::new(&WindSettings { seed, ..SETTINGS }, &[0.0; 8]);
         let mean_pressure = |start: f64, duration: f64| {
             let times = (0..20).map(|index| start + duration * f64::from(index) / 20.0);
-            times.map(|time| wind.pressures(time)[0].downwind).sum::<f64>() / 20.0
+            times.map(|time| wind.pressures(time)[0].downwind / MEAN_PRESSURE).sum::<f64>() / 20.0
         };
         let (gust, mean) = (mean_pressure(0.35, 0.8), mean_pressure(0.35, 300.0));
         assert!(gust > 1.4 * mean && (0.7..1.6).contains(&mean), "seed {seed}: gust {gust}, mean {mean}");
@@ -189,8 +200,8 @@ fn run_begins_with_a_strong_gust() {
 
 #[test]
 fn gust_arrives_later_downwind() {
-    // Below 0.1 Hz, the gusts of different domains are nearly the same. The gusts take 1.2 s to travel 14.4 units,
-    // because a diagonal of 10 units stands for 10 m, and the mean speed is 12 m/s.
+    // Below 0.1 Hz, the gusts of different domains are nearly the same. The gusts take 1.2 s to travel 14.4 m at the mean
+    // speed of 12 m/s.
     let wind = Wind::new(&WindSettings { max_frequency: 0.1, ..SETTINGS }, &[0.0, 14.4]);
     let difference = |delay: f64| {
         let square = |index: u32| {
@@ -212,5 +223,21 @@ fn frequencies_above_the_limit_are_left_out() {
     assert_eq!((count(8.0), count(0.01)), (COSINE_COUNT, 0));
     assert!(count(1.0) < COSINE_COUNT && count(1.0) > 0);
     let steady_wind = Wind::new(&WindSettings { max_frequency: 0.01, ..SETTINGS }, &[0.0]);
-    assert_eq!(steady_wind.pressures(5.0), [WindPressure { downwind: 1.0, crosswind: 0.0 }]);
+    assert_eq!(steady_wind.pressures(5.0), [WindPressure { downwind: MEAN_PRESSURE, crosswind: 0.0 }]);
+}
+
+/// Four times the pressure at twice the speed, on the average over ten minutes.
+#[test]
+fn pressure_is_proportional_to_the_square_of_the_speed() {
+    let mean_pressure = |mean_speed: f64| {
+        let wind = Wind::new(&WindSettings { mean_speed, ..SETTINGS }, &[0.0; 4]);
+        let pressure = |sample: u32| wind.pressures(10.0 + 0.2 * f64::from(sample))[2].downwind;
+        (0..3000).map(pressure).sum::<f64>() / 3000.0
+    };
+    let (breeze, gale) = (mean_pressure(8.0), mean_pressure(16.0));
+    assert!((3.6..4.4).contains(&(gale / breeze)), "{breeze} Pa at 8 m/s, {gale} Pa at 16 m/s");
+    // Turbulence adds its variance to the square of the mean speed.
+    assert!((1.0..1.3).contains(&(breeze / (0.5 * AIR_DENSITY * 64.0))), "{breeze}");
+    assert_eq!(mean_pressure(0.0), 0.0);
+    assert!((mean_pressure(1e6) / 0.6125e12 - 1.0).abs() < 0.3 && mean_pressure(1e-6) > 0.0);
 }

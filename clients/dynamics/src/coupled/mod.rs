@@ -1,0 +1,226 @@
+//! Domains that act on each other at joints: linear equations of motion about rest, and their integrator.
+//!
+//! The material of a domain moves by R X + U q, where X is the small motion of its frame and R are the six rigid motions
+//! (`joints`). The frame of a child moves with the section of its parent that carries it, so the inertia of the child
+//! loads the parent, and the motion of the parent shakes the child. The frames of roots do not move, so all X are
+//! functions of q, and the energy is 1/2 v^T M v + 1/2 q^T K q with the diagonal matrix K of eigenvalues. U are modes
+//! with loaded interfaces (Benfield and Hruda 1971): eigenmodes of a domain that carries the rigid inertia of its
+//! descendants.
+//!
+//! A step of dt seconds uses the implicit midpoint rule: with the acceleration a,
+//!
+//! ```text
+//! (M + dt/2 C + dt^2/4 K) a = f - C v - K (q + dt/2 v),    q' = q + dt v + dt^2/2 a,    v' = v + dt a
+//! ```
+//!
+//! It conserves the energy of a free motion without damping at any dt. `mass` factors the matrix once. A step then
+//! has one sweep from the leaves to the roots and one back, so its time is proportional to the number of domains.
+
+#[cfg(test)]
+mod beam_tests;
+mod joints;
+mod mass;
+mod statics;
+#[cfg(test)]
+pub(crate) mod testing;
+#[cfg(test)]
+mod tests;
+
+use std::ops::Range;
+
+use nalgebra::Vector6;
+use rayon::prelude::*;
+
+use crate::error::{Result, invalid_input};
+use crate::integrator::{Integrator, LoadChange, MotionState, StepReport};
+use crate::model::{MIN_DOMAINS_PER_THREAD, Model};
+use crate::parameters::{ModalParameters, ModeParameters};
+use joints::Body;
+pub use joints::JointTree;
+use mass::{Diagonal, Factor, factor_bodies};
+pub use statics::{StaticResponse, StaticSystem};
+
+/// The modes of all domains of a scene, coupled at joints.
+pub struct CoupledModes {
+    tree: JointTree,
+    /// Per body.
+    factors: Vec<Factor>,
+    /// Per coordinate; `None` for a mode that is held still.
+    modes: Vec<Option<ModeTerms>>,
+    dt: f64,
+}
+
+/// Stiffness and damping of a coordinate.
+#[derive(Debug, Clone, Copy)]
+struct ModeTerms {
+    /// omega^2.
+    stiffness: f64,
+    /// 2 zeta omega: the damping ratio holds for the mode of the domain alone.
+    damping: f64,
+}
+
+/// The bodies of a part of a level with their numbers in a step.
+struct LevelPart<'a> {
+    first_body: usize,
+    /// Forces on the coordinates of the bodies, then accelerations.
+    coordinates: &'a mut [f64],
+    /// Per body: the wrench that it passes to its parent, or the acceleration of its frame.
+    frames: &'a mut [Vector6<f64>],
+}
+
+impl CoupledModes {
+    /// Factors the equations of steps of `dt` seconds.
+    ///
+    /// # Errors
+    /// `Invalid` if `dt` is not positive and finite; if a domain shares coordinates, but moves with a domain that has
+    /// others; or if the mass properties of a domain are invalid.
+    pub fn new(model: &Model, parameters: &ModalParameters, dt: f64) -> Result<Self> {
+        if !(dt.is_finite() && dt > 0.0) {
+            return Err(invalid_input("dt", "a positive number of seconds", dt));
+        }
+        let tree = JointTree::new(model)?;
+        let terms = |mode: &ModeParameters| {
+            let ModeParameters { eigenvalue, damping_ratio } = *mode;
+            ModeTerms { stiffness: eigenvalue, damping: 2.0 * damping_ratio * eigenvalue.sqrt() }
+        };
+        let modes: Vec<Option<ModeTerms>> = parameters.modes.iter().map(|mode| mode.as_ref().map(terms)).collect();
+        let diagonal_term = |mode: &ModeTerms| 0.5 * dt * mode.damping + 0.25 * dt * dt * mode.stiffness;
+        let diagonal: Vec<Diagonal> = modes.iter().map(|mode| mode.as_ref().map(diagonal_term)).collect();
+        let factors = factor_bodies(model, &tree, &diagonal)?;
+        Ok(Self { tree, factors, modes, dt })
+    }
+
+    /// The joints of the scene.
+    pub const fn joints(&self) -> &JointTree {
+        &self.tree
+    }
+
+    /// Solves the equations of a step: replaces the forces on all coordinates, in the order of bodies, by accelerations.
+    fn solve(&self, coordinates: &mut [f64]) {
+        let bodies = &self.tree.bodies;
+        let end_of = |level: &Range<usize>| bodies[level.end - 1].offset + bodies[level.end - 1].rank;
+        // Per body: the wrench that it passes to its parent.
+        let mut wrenches = vec![Vector6::zeros(); bodies.len()];
+        for level in self.tree.levels.iter().rev() {
+            let (level_wrenches, child_wrenches) = wrenches.split_at_mut(level.end);
+            let level_coordinates = &mut coordinates[bodies[level.start].offset..end_of(level)];
+            let parts = self.split_level(level, level_coordinates, &mut level_wrenches[level.start..]);
+            run_parts(parts, |part| self.eliminate(part, level.end, child_wrenches));
+        }
+        // Per body: the acceleration of its frame.
+        let mut accelerations = wrenches;
+        for level in &self.tree.levels {
+            let (parent_accelerations, level_accelerations) = accelerations.split_at_mut(level.start);
+            let (parent_coordinates, level_coordinates) = coordinates.split_at_mut(bodies[level.start].offset);
+            let level_coordinates = &mut level_coordinates[..end_of(level) - parent_coordinates.len()];
+            let parts = self.split_level(level, level_coordinates, &mut level_accelerations[..level.len()]);
+            run_parts(parts, |part| self.substitute(part, parent_coordinates, parent_accelerations));
+        }
+    }
+
+    /// Splits a level, so that a thread gets at least `MIN_DOMAINS_PER_THREAD` bodies.
+    fn split_level<'a>(
+        &self,
+        level: &Range<usize>,
+        mut coordinates: &'a mut [f64],
+        frames: &'a mut [Vector6<f64>],
+    ) -> Vec<LevelPart<'a>> {
+        let mut parts = vec![];
+        let mut first_body = level.start;
+        for frames in frames.chunks_mut(MIN_DOMAINS_PER_THREAD) {
+            let bodies = &self.tree.bodies[first_body..first_body + frames.len()];
+            let count = bodies.iter().map(|body| body.rank).sum();
+            let (part_coordinates, rest) = std::mem::take(&mut coordinates).split_at_mut(count);
+            parts.push(LevelPart { first_body, coordinates: part_coordinates, frames });
+            (coordinates, first_body) = (rest, first_body + bodies.len());
+        }
+        parts
+    }
+
+    /// Adds the wrenches of the children of every body, and computes the wrench that the body passes to its parent.
+    /// `child_wrenches` begins with the body `first_child`.
+    fn eliminate(&self, part: LevelPart<'_>, first_child: usize, child_wrenches: &[Vector6<f64>]) {
+        for_each_body(part, &self.tree, &self.factors, |body, factor, forces, frame| {
+            let mut wrench = Vector6::zeros();
+            for child in body.children.clone() {
+                let Some(joint) = &self.tree.bodies[child].joint else { continue };
+                let child_wrench = &child_wrenches[child - first_child];
+                joint.add_modal_forces(child_wrench, forces);
+                wrench += joint.transport_back(child_wrench);
+            }
+            let responses = forces.iter().zip(&factor.frame_response);
+            *frame = responses.fold(wrench, |wrench, (force, response)| wrench - response * *force);
+        });
+    }
+
+    /// Computes the acceleration of the frame of every body from those of its parent, and the accelerations of its
+    /// coordinates.
+    fn substitute(&self, part: LevelPart<'_>, parent_coordinates: &[f64], parent_accelerations: &[Vector6<f64>]) {
+        for_each_body(part, &self.tree, &self.factors, |body, factor, forces, frame| {
+            *frame = body.joint.as_ref().map_or_else(Vector6::zeros, |joint| {
+                let parent = &self.tree.bodies[joint.body];
+                joint.apply(&parent_accelerations[joint.body], &parent_coordinates[parent.offset..][..parent.rank])
+            });
+            factor.solve(forces);
+            for (acceleration, response) in forces.iter_mut().zip(&factor.frame_response) {
+                *acceleration -= response.dot(frame);
+            }
+        });
+    }
+}
+
+impl Integrator for CoupledModes {
+    fn advance(&self, state: &mut MotionState, load: LoadChange<'_>) -> Result<StepReport> {
+        let h = self.dt;
+        let mut accelerations = vec![0.0; state.q.len()];
+        let coordinates = || {
+            let bodies = self.tree.bodies.iter();
+            bodies.flat_map(|body| (0..body.rank).map(|mode| (body.offset + mode, body.first_coordinate + mode)))
+        };
+        for (position, index) in coordinates() {
+            let Some(ModeTerms { stiffness, damping }) = self.modes[index] else { continue };
+            let (q, v) = (state.q[index], state.v[index]);
+            let force = 0.5 * (load.start[index] + load.end[index]);
+            accelerations[position] = force - damping * v - stiffness * (q + 0.5 * h * v);
+        }
+        self.solve(&mut accelerations);
+        for (position, index) in coordinates() {
+            let velocity_change = h * accelerations[position];
+            state.q[index] += h * (state.v[index] + 0.5 * velocity_change);
+            state.v[index] += velocity_change;
+        }
+        Ok(StepReport { sub_steps: 1, ..StepReport::default() })
+    }
+
+    fn dt(&self) -> f64 {
+        self.dt
+    }
+}
+
+/// Runs `work` for all bodies of a part with their factors, coordinates and frames.
+fn for_each_body(
+    part: LevelPart<'_>,
+    tree: &JointTree,
+    factors: &[Factor],
+    work: impl Fn(&Body, &Factor, &mut [f64], &mut Vector6<f64>),
+) {
+    let LevelPart { first_body, mut coordinates, frames } = part;
+    let bodies = tree.bodies[first_body..].iter().zip(&factors[first_body..]);
+    for ((body, factor), frame) in bodies.zip(frames) {
+        let (body_coordinates, rest) = coordinates.split_at_mut(body.rank);
+        work(body, factor, body_coordinates, frame);
+        coordinates = rest;
+    }
+}
+
+/// Runs `work` for all parts of a level, concurrently if there are several.
+fn run_parts<'a>(mut parts: Vec<LevelPart<'a>>, work: impl Fn(LevelPart<'a>) + Send + Sync) {
+    match parts.pop() {
+        Some(part) if parts.is_empty() => work(part),
+        Some(part) => {
+            parts.push(part);
+            parts.into_par_iter().for_each(work);
+        }
+        None => {}
+    }
+}
