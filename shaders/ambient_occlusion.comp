@@ -1,10 +1,10 @@
 // Ambient occlusion by horizon angles: Jimenez, Wu, Pesce and Jarabo, "Practical Real-Time Strategies for Accurate
 // Indirect Occlusion", SIGGRAPH 2016 courses (GTAO). A slice is a plane through the view ray. The visible part of the
 // hemisphere in a slice lies between two horizons, one on each side, and its cosine-weighted integral has a closed
-// form. Each side samples STEPS surface points. A point above the horizon raises it. A point at the
-// distance d has the weight 1 - (d / R)^2. The arc between the old and the new horizon is occluded with the mean weight
-// of the points at its ends. The visibility is the ratio of the integrals with and without occluders over SLICES
-// slices.
+// form. Each side samples STEPS surface points. A point above the horizon raises it, unless both of its neighbors are far
+// behind it: then it is on a thin surface. A point at the distance d has the weight 1 - (d / R)^2. The arc between the old
+// and the new horizon is occluded with the mean weight of the points at its ends. The visibility is the ratio of the
+// integrals with and without occluders over SLICES slices.
 //   surface           (in)   see ambient_surface.comp
 //   noisy_visibility  (out)  of the same size  RG32F: visibility, 0 to 1; 1 / depth, 0 for the sky
 // The directions and distances of the points differ within each square of AMBIENT_NOISE x AMBIENT_NOISE texels.
@@ -13,6 +13,8 @@ layout(binding = 0) uniform usampler2D surface;
 layout(rg32f, binding = 0) uniform writeonly image2D noisy_visibility;
 
 const float PI = 3.14159265;
+// Between two points of one surface, the depth changes by at most this multiple of their distance in the image plane.
+const float MAX_SLOPE = 2.0;
 
 // acos with an error of at most 7e-5 (Abramowitz and Stegun, 4.4.45).
 float fast_acos(float x) {
@@ -89,18 +91,34 @@ void main() {
                 float horizon_weight = 0.0; // of the point at the horizon; 0 without one
                 float horizon_arc = visible_arc(slice, slice.normal_angle + direction_sign * 0.5 * PI, horizon_cosine,
                     direction_sign * slice.normal_cosine);
+                // Depths of the points: 0 for the sky and outside of the image. `rises`: MAX_SLOPE times the distance
+                // from the texel in the image plane at its depth.
+                ivec2 taps[STEPS];
+                float depths[STEPS], rises[STEPS];
                 for (int step = 0; step < STEPS; step++) {
                     float part = (float(step) + shift) / float(STEPS);
                     vec2 move = direction_sign * axis * max(reach * part * part, vec2(float(step) + 1.0));
-                    ivec2 tap = texel + ivec2(round(move));
-                    ivec2 inside = clamp(tap, ivec2(0), size - 1);
-                    float tap_depth = uintBitsToFloat(texelFetch(surface, inside, 0).x);
-                    vec3 offset = tap_depth * (rays * vec3(inside, 1.0)) - point;
+                    ivec2 shift_texels = ivec2(round(move)), tap = texel + shift_texels;
+                    taps[step] = clamp(tap, ivec2(0), size - 1);
+                    depths[step] = tap == taps[step] ? uintBitsToFloat(texelFetch(surface, taps[step], 0).x) : 0.0;
+                    rises[step] = MAX_SLOPE * depth * length(vec2(shift_texels) * texel_side);
+                }
+                float previous_bound = depth;
+                for (int step = 0; step < STEPS; step++) {
+                    float tap_depth = depths[step];
+                    vec3 offset = tap_depth * (rays * vec3(taps[step], 1.0)) - point;
                     float squared_distance = max(dot(offset, offset), 1e-30);
                     float cosine = min(dot(offset, to_eye) * inversesqrt(squared_distance), 1.0);
                     float weight = 1.0 - squared_distance / (radius * radius);
-                    // The sky and points outside of the image occlude nothing. The ground is added below.
-                    if (tap_depth > 0.0 && weight > 0.0 && tap == inside && cosine > horizon_cosine) {
+                    // A point that is in front of both neighbors is on a thin surface, behind which light passes.
+                    float distant = tap_depth == 0.0 ? 1e30 : abs(tap_depth);
+                    bool is_connected = distant + rises[step] > previous_bound;
+                    if (step + 1 < STEPS && depths[step + 1] != 0.0) {
+                        is_connected = is_connected || abs(depths[step + 1]) - rises[step + 1] < distant - rises[step];
+                    }
+                    previous_bound = distant + rises[step];
+                    // The sky occludes nothing. The ground is added below.
+                    if (tap_depth > 0.0 && weight > 0.0 && is_connected && cosine > horizon_cosine) {
                         float sine = direction_sign * sqrt(max(1.0 - cosine * cosine, 0.0));
                         float arc = visible_arc(slice, direction_sign * fast_acos(cosine), cosine, sine);
                         float arc_weight = horizon_weight > 0.0 ? 0.5 * (horizon_weight + weight) : weight;

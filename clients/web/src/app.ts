@@ -4,8 +4,10 @@ import { budgetProblem } from "./budget";
 import type { PictureView } from "./control/picture_view";
 import type { PullTool } from "./control/pull";
 import { PullGesture } from "./control/pull_gesture";
+import { pullProblem } from "./control/pull_problem";
 import { positionOf, type SurfacePoint } from "./control/surface_point";
 import { Output } from "./proto/modalcast/v1/frames_pb";
+import { cssColor, lightingOf } from "./render/lighting";
 import type { SceneRenderer } from "./render/scene_renderer";
 import { Viewport } from "./render/viewport";
 import type { Vec3 } from "./scene/affine";
@@ -30,12 +32,17 @@ import * as format from "./ui/format";
 import { Help } from "./ui/help";
 import { Notices } from "./ui/notices";
 import { Panel } from "./ui/panel";
+import { PullHint } from "./ui/pull_hint";
 import { RemarksSection } from "./ui/remarks";
 import { ScaleBar } from "./ui/scale_bar";
 import { defaultSettings } from "./ui/settings";
+import { sliderHint } from "./ui/slider_hint";
 import { StatusPanels } from "./ui/status_panels";
 import type { Toolbar } from "./ui/toolbar";
 import { ViewSection } from "./ui/view_section";
+
+/** Milliseconds between two updates of the panel of modes. */
+const COORDINATES_MS = 60;
 
 export class App implements CommandHandlers {
     private readonly stage = byId("stage");
@@ -46,6 +53,7 @@ export class App implements CommandHandlers {
     readonly notices = new Notices();
     readonly settings = defaultSettings();
     readonly status: StatusPanels;
+    private readonly pullHint = new PullHint(this.notices);
     private readonly remarks: RemarksSection;
     private readonly toolbar: Toolbar;
     private readonly capture: Capture;
@@ -63,16 +71,29 @@ export class App implements CommandHandlers {
     playback: Playback | null = null;
     private isPaused = false;
     private showsOneStep = false;
+    /** Whether the panel of modes does not show the state of the view yet, and when it was updated. */
+    private hasNewState = false;
+    private lastCoordinates = -Infinity;
     private driveHint = "";
     private framedScene = "";
     private timeScale = new TimeScale();
 
     constructor() {
         this.coordinates = new CoordinateSection({
-            set: (domain, mode, value) => this.session?.driver?.set(domain, mode, value),
+            set: (domain, mode, value) => {
+                const { session } = this;
+                if (session?.sliderEffect === "forces") session.modeForces?.set(domain, mode, value);
+                else session?.driver?.set(domain, mode, value);
+            },
             animate: (...mode) => this.session?.driver?.animate(...mode),
             stop: () => this.session?.driver?.stopAnimation(),
-            reset: (domain) => this.session?.driver?.reset(domain),
+            reset: (domain) => {
+                const { session } = this;
+                if (session?.sliderEffect === "forces") session.modeForces?.reset(domain);
+                else session?.driver?.reset(domain);
+            },
+            canHold: (domain, mode) => this.session?.modeForces?.canHold(domain, mode) ?? false,
+            target: (domain, mode) => this.session?.modeForces?.target(domain, mode) ?? 0,
         });
         this.remarks = new RemarksSection(this.panel, this.notices);
         this.panel.add("View", this.view.element, true);
@@ -138,11 +159,12 @@ export class App implements CommandHandlers {
         } else settings.pictures = true;
         if (renderer && !source.features.pictures) settings.pictures = false;
         this.view.restrict(renderer !== null, source.features.pictures, hint);
+        this.view.setBackground(lightingOf(scene));
         this.view.setModes(scene.shapes.reduce((largest, shape) => Math.max(largest, shape.rank), 0));
         this.domains.setScene(scene);
         this.panel.setCount("Parts", format.count(scene.domains.length));
         this.status.showScene(scene.info);
-        this.remarks.set(scene.info.remarks);
+        this.remarks.set(scene.info);
         this.frameOnce(scene);
         this.connectSession(session);
         this.coordinates.setScene(model, session.deflections);
@@ -164,9 +186,10 @@ export class App implements CommandHandlers {
         this.viewport.setScene(null);
         this.driveHint = "";
         this.notices.hide("receiver");
-        this.remarks.set([]);
+        this.remarks.set(null);
         this.bar.setTimeScale("");
         this.forceLines.setSession(null);
+        this.pullHint.update(false);
     }
 
     /** Changes the settings, and applies them. */
@@ -246,11 +269,11 @@ export class App implements CommandHandlers {
     toggleHelp = (): void => this.help.toggle();
 
     private connectSession(session: SceneSession): void {
-        const { model, pictures, pull, driver } = session;
+        const { model, pictures, pull, driver, modeForces } = session;
         model.onState = () => this.onState(session);
         model.onForces = () => {
             this.viewport.invalidate();
-            const text = model.receiverError && `Nothing answers a pull. ${model.receiverError}`;
+            const text = model.receiverError && pullProblem(model.scene, model.receiverError, location.origin);
             this.notices.show("receiver", text, { severity: "warn", duration: 0 });
         };
         if (pictures) {
@@ -262,9 +285,13 @@ export class App implements CommandHandlers {
                 this.notices.show("pictures", `The server's pictures ended: ${message}`, { severity: "bad" });
         }
         if (pull) {
-            pull.onChange = () => this.viewport.invalidate();
+            pull.onChange = () => {
+                if (pull.grabbed) this.pullHint.end();
+                this.viewport.invalidate();
+            };
             pull.onMessage = (message) => this.notices.show("pull", message, { severity: "warn" });
         }
+        if (modeForces) modeForces.onMessage = (message) => this.notices.show("hold", message, { severity: "warn" });
         if (driver) {
             driver.onStatus = (status) => {
                 this.driveHint = status.kind === "refused" ? status.message : "";
@@ -279,9 +306,11 @@ export class App implements CommandHandlers {
         this.status.stateRate.add(1);
         this.status.byteRate.add(model.lastStateBytes);
         session.receiveState();
-        if (model.state.step) this.timeScale.add(model.state.step, performance.now());
+        const isOwn = model.state.step?.run === session.driver?.run;
+        if (model.state.step && !isOwn) this.timeScale.add(model.state.step, performance.now());
         if (this.isPaused && !this.showsOneStep) return;
         this.showsOneStep = false;
+        this.hasNewState = true;
         // A step that changes nothing has no bytes.
         if (model.lastStateBytes === 0) return;
         if (!this.settings.pictures) renderer?.update(model.state);
@@ -313,6 +342,8 @@ export class App implements CommandHandlers {
             session.renderer.setOptions(settings);
             session.renderer.update(session.model.state);
         }
+        // Behind the corners of the sheet on a phone.
+        document.body.style.background = session?.renderer ? cssColor(session.renderer.backgroundColor) : "";
         session?.colorScale.select(settings.color, performance.now());
         session?.renderer?.setColorScale(session.colorScale.end);
         if (settings.pictures) session?.pictures?.start(this.pictureOptions());
@@ -372,18 +403,26 @@ export class App implements CommandHandlers {
     private drawOverlays(): void {
         const { camera } = this.viewport;
         this.forceLines.draw(camera);
+        // With the frame that shows the state, so that numbers and picture agree.
+        if (this.hasNewState && performance.now() - this.lastCoordinates >= COORDINATES_MS) this.updateCoordinates();
         if (!this.model) return;
         this.axes.draw(camera);
         this.scaleBar.draw(camera.unitsPerPixel * this.model.scene.info.unit);
     }
 
+    private updateCoordinates(): void {
+        this.hasNewState = false;
+        this.lastCoordinates = performance.now();
+        this.coordinates.update(this.pull?.view?.deflection ?? null);
+    }
+
     private updatePanels(): void {
         const { session } = this;
         if (!session) return;
-        const { driver, source, isDriven } = session;
-        const driven = isDriven ? "A physics process controls this scene." : this.driveHint;
-        this.coordinates.setCanDrive(source.features.drive && !isDriven, source.features.drive ? driven : "");
-        this.coordinates.update();
+        const { driver, modeForces } = session;
+        this.pullHint.update(modeForces?.hasReceiver === true);
+        this.coordinates.setEffect(session.sliderEffect, (!session.isDriven && this.driveHint) || sliderHint(session));
+        if (!this.isPaused || this.hasNewState) this.updateCoordinates();
         if (!this.isPaused) this.fitColorScale(session);
         if (driver && !driver.isAnimating) this.coordinates.setAnimated(false);
         this.updateTimeScale(session);
@@ -391,10 +430,12 @@ export class App implements CommandHandlers {
     }
 
     /** The panel shows every time scale, and the bar those that are at least two times slower or faster than real time. */
-    private updateTimeScale({ driver, isDriven }: SceneSession): void {
+    private updateTimeScale(session: SceneSession): void {
+        const { driver, isDriven } = session;
         const own = this.playback?.speed ?? driver?.timeScale ?? null;
-        const ratio = own ?? (isDriven ? this.timeScale.ratio(performance.now()) : null);
+        const ratio = own ?? this.timeScale.recentRatio(performance.now());
         this.status.timeScale = ratio;
+        session.updateModeForces(isDriven ? ratio : null);
         const isVisible = ratio !== null && (ratio <= 0.5 || ratio >= 2);
         this.bar.setTimeScale(isVisible ? format.timeScale(ratio) : "");
     }

@@ -98,18 +98,18 @@ test("the color map ends at a round number above the largest deflection", () => 
     assert.equal(scale.end, 0, "no color map");
     const deflection = { kind: "displacement" } as const;
     scale.select(deflection, 0);
-    assert.equal(scale.end, 0.5, "q = (0.5, 0) deflects by 0.25 m");
+    assert.equal(scale.end, 0.25, "q = (0.5, 0) deflects by 0.25 m");
     model.state.q[0] = 3;
     assert.equal(scale.update(20), false, "at most one evaluation in 50 ms");
     assert.equal(scale.update(60), true);
-    assert.equal(scale.end, 2);
+    assert.equal(scale.end, 1.5);
     scale.select(deflection, 120);
-    assert.equal(scale.end, 2, "the same choice keeps its range");
+    assert.equal(scale.end, 1.5, "the same choice keeps its range");
     for (let now = 120; now < 8000; now += 100) {
         model.state.q[0] = 1e-3;
         scale.update(now);
     }
-    assert.equal(scale.end, 1e-3);
+    assert.equal(scale.end, 6e-4);
 });
 
 test("the color map of a mode ends at its largest displacement", () => {

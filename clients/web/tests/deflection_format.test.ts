@@ -4,7 +4,7 @@ import { limitedNewtons, signedMeters, speed } from "../src/ui/format";
 
 test("a deflection has a sign and a unit that fits", () => {
     const texts = [0.0026, -0.00013, 0, 1.5, -2.5e-8].map(signedMeters);
-    assert.deepEqual(texts, ["+2.6 mm", "−130 µm", "0 m", "+1.5 m", "−25 nm"]);
+    assert.deepEqual(texts, ["+2.6 mm", "−130 µm", "0", "+1.5 m", "−25 nm"]);
 });
 
 test("a force names its limit or says that it is unknown", () => {

@@ -5,8 +5,9 @@ import { test } from "node:test";
 import { create } from "@bufbuild/protobuf";
 import { LightingSchema } from "../src/proto/modalcast/v1/scenes_pb";
 import { texelsFromPixels } from "../src/render/ambient_occlusion";
-import { lightingOf, lightOf } from "../src/render/lighting";
+import { cssColor, displayedOf, groundColor, keepsBackground, lightingOf, lightOf } from "../src/render/lighting";
 import type { SceneDescription } from "../src/scene/description";
+import { backgroundName } from "../src/ui/view_section";
 import { fourDomains } from "./scene";
 
 function sceneWith(lighting: Parameters<typeof create<typeof LightingSchema>>[1], up = "y"): SceneDescription {
@@ -44,6 +45,34 @@ test("a scene with an ambient cube is viewed from higher up", () => {
     assert.deepEqual(lightingOf(sceneWith({})).toCamera, [0.42, 0.14, 0.9]);
     // Servers of older versions send no lighting.
     assert.deepEqual(lightingOf(fourDomains()).toCamera, [0.42, 0.14, 0.9]);
+});
+
+test("the color of the ground is its lit and displayed color", () => {
+    const sun = { toSun: [0, 1, 0], sunlight: [1, 1, 1], skylight: [0.5, 0.5, 0.5], horizon: [0.3, 0.4, 0.5] };
+    const ground = sceneWith({ ...sun, ground: [0.2, 0.4, 0.6], exposure: 1 });
+    assert.deepEqual(
+        groundColor(lightingOf(ground), 1).map((value) => Number(value.toFixed(6))),
+        [0.3, 0.6, 0.9],
+    );
+    // Without a ground, the horizon; in a studio, the ambient light of the upper side.
+    assert.deepEqual(groundColor(lightingOf(sceneWith({ ...sun, exposure: 1 })), 1), [0.3, 0.4, 0.5]);
+    const studio = lightingOf(sceneWith({ ...sun, ground: [1, 1, 1], ambientCube: CUBE, exposure: 1 }));
+    const [red] = groundColor({ ...studio, sunlight: [0, 0, 0] }, 1);
+    assert.ok(Math.abs(red - (CUBE[6] ?? 0)) < 1e-9, `${red}`);
+    for (const tone of [0, 1, 2])
+        for (const value of [0.1, 0.5, 0.9]) {
+            const curve = { exposure: 1.5, tone };
+            assert.ok(Math.abs(displayedOf(lightOf(value, curve), curve) - value) < 1e-9);
+        }
+    assert.equal(cssColor([0, 0.5, 1]), "rgb(0 188 255)");
+});
+
+test("a background has the name of what is shown", () => {
+    const outdoor = lightingOf(sceneWith({ skylight: [1, 1, 1], ground: [1, 1, 1] }));
+    const studio = lightingOf(sceneWith({ ambientCube: CUBE, ground: [1, 1, 1] }));
+    const names = [outdoor, studio, { ...outdoor, ground: null }].map(backgroundName);
+    assert.deepEqual(names, ["Sky and ground", "Studio", "Sky"]);
+    assert.deepEqual([outdoor, studio].map(keepsBackground), [false, true]);
 });
 
 test("texels of images of odd size are at the centers of pixels", () => {

@@ -45,6 +45,21 @@ test("a new run and a new time begin a new measurement", () => {
     assert.ok(Math.abs((scale.ratio(now) ?? 0) / 10 - 1) < 0.02, "expected the ratio after the jump back in time");
 });
 
+test("a ratio is remembered while a busy page receives no steps", () => {
+    const scale = new TimeScale();
+    const now = receive(scale, 1n, 0.00016, 200);
+    assert.ok(Math.abs((scale.recentRatio(now) ?? 0) / 0.01 - 1) < 0.02);
+    // Steps arrive again after a pause of 1.5 s: the measurement has begun again.
+    scale.add(step(1n, 0.05), now + 1500);
+    assert.equal(scale.ratio(now + 1500), null, "control");
+    assert.ok(Math.abs((scale.recentRatio(now + 1500) ?? 0) / 0.01 - 1) < 0.02);
+    // Not for long, and not for another run.
+    assert.equal(scale.recentRatio(now + 6000), null);
+    scale.recentRatio(receive(scale, 1n, 0.00016, 200, now + 7000));
+    scale.add(step(2n, 0), now + 10_300);
+    assert.equal(scale.recentRatio(now + 10_300), null);
+});
+
 test("there is no ratio before the first second, in a pause, or while the time stands still", () => {
     const scale = new TimeScale();
     assert.equal(scale.ratio(0), null);

@@ -15,6 +15,7 @@ import { at, toF32 } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
 import type { Server, SurfaceForceMessage } from "../source/server";
 import { type PointCompliance, pointCompliance } from "./point_compliance";
+import { pullProblem } from "./pull_problem";
 import { deflectionAt, displacementAt, jointPoint, positionOf, type SurfacePoint, surfacePoint } from "./surface_point";
 
 /** Milliseconds between renewals of a force, and until the server removes a force that is not renewed. */
@@ -184,13 +185,11 @@ export class PullTool {
         try {
             const response = await this.server.applyForces(scene, this.owner, forces, LIFETIME_MS);
             this.ownerNumber = response.owner;
+            // After a pull, its message stays for the user to read.
+            if (forces.length === 0) return;
             // If the reason is known, the page shows it already.
-            const isLost = forces.length > 0 && response.receivers === 0 && !this.model.receiverError;
-            this.onMessage(
-                isLost
-                    ? "Nobody receives forces: no physics process reads them. `modalcast-sim --forces` moves a scene with eigenvalues or cubic forces."
-                    : "",
-            );
+            const isLost = response.receivers === 0 && !this.model.receiverError;
+            this.onMessage(isLost ? pullProblem(this.model.scene, "", globalThis.location?.origin ?? "") : "");
         } catch (error) {
             this.onMessage(`The server did not accept the force: ${error instanceof Error ? error.message : error}`);
         }

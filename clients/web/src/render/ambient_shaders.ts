@@ -179,6 +179,8 @@ const float PI = 3.14159265;
 const int ROTATION_STRIDE = 7;
 // The largest reach in the image, as a fraction of its height.
 const float MAX_REACH = 0.35;
+// Between two points of one surface, the depth changes by at most this multiple of their distance in the image plane.
+const float MAX_SLOPE = 2.0;
 
 // acos with an error of at most 7e-5 (Abramowitz and Stegun, 4.4.45).
 float fast_acos(float x) {
@@ -209,24 +211,44 @@ float ground_occlusion(float height, float descent) {
 }
 
 // The part of the integral of a slice that surface points on one side (1 or -1) of a point occlude.
-float lost_arc(Slice slice, float side, ivec2 texel, vec2 reach, float shift, vec3 point, vec3 to_eye) {
+// rise: MAX_SLOPE times the side of a texel at the depth of the point.
+float lost_arc(Slice slice, float side, ivec2 texel, vec2 reach, float shift, vec3 point, vec3 to_eye, float own_depth,
+    vec2 rise) {
     ivec2 size = textureSize(surface, 0);
     // Without occluders, the horizon is 90 degrees from the normal.
     float horizon_cosine = -side * slice.normal_sine, lost = 0.0;
     float horizon_weight = 0.0;      // of the point at the horizon; 0 without one
     float horizon_arc =
         visible_arc(slice, slice.normal_angle + side * 0.5 * PI, horizon_cosine, side * slice.normal_cosine);
+    // Depths of the points: 0 for the sky and outside of the image.
+    ivec2 taps[STEPS];
+    float depths[STEPS], rises[STEPS];
+    bool is_occluder[STEPS];
     for (int step = 0; step < STEPS; step++) {
         float part = (float(step) + shift) / float(STEPS);
-        ivec2 tap = texel + ivec2(round(side * slice.axis * max(reach * part * part, vec2(float(step) + 1.0))));
-        ivec2 inside = clamp(tap, ivec2(0), size - 1);
-        float depth = uintBitsToFloat(texelFetch(surface, inside, 0).x);
-        vec3 offset = depth * view_ray(ambient_ndc(inside)) - point;
+        ivec2 move = ivec2(round(side * slice.axis * max(reach * part * part, vec2(float(step) + 1.0))));
+        taps[step] = clamp(texel + move, ivec2(0), size - 1);
+        AmbientSurface there = surface_at(taps[step], view_ray(ambient_ndc(taps[step])));
+        depths[step] = texel + move == taps[step] ? there.depth : 0.0;
+        is_occluder[step] = depths[step] > 0.0 && !there.is_ground;
+        rises[step] = length(vec2(move) * rise);
+    }
+    float previous_bound = own_depth;
+    for (int step = 0; step < STEPS; step++) {
+        float depth = depths[step];
+        vec3 offset = depth * view_ray(ambient_ndc(taps[step])) - point;
         float squared_distance = max(dot(offset, offset), 1e-30);
         float cosine = min(dot(offset, to_eye) * inversesqrt(squared_distance), 1.0);
         float weight = 1.0 - squared_distance / (ambient_radius * ambient_radius);
-        // The sky and the ground occlude nothing, nor do points outside of the image.
-        if (depth > 0.0 && weight > 0.0 && tap == inside && cosine > horizon_cosine) {
+        // A point that is in front of both neighbors is on a thin surface, behind which light passes.
+        float distant = depth == 0.0 ? 1e30 : depth;
+        bool is_connected = distant + rises[step] > previous_bound;
+        if (step + 1 < STEPS && depths[step + 1] > 0.0) {
+            is_connected = is_connected || depths[step + 1] - rises[step + 1] < distant - rises[step];
+        }
+        previous_bound = distant + rises[step];
+        // The sky and the ground occlude nothing.
+        if (is_occluder[step] && weight > 0.0 && is_connected && cosine > horizon_cosine) {
             float sine = side * sqrt(max(1.0 - cosine * cosine, 0.0));
             float arc = visible_arc(slice, side * fast_acos(cosine), cosine, sine);
             lost += (horizon_weight > 0.0 ? 0.5 * (horizon_weight + weight) : weight) * (horizon_arc - arc);
@@ -238,7 +260,7 @@ float lost_arc(Slice slice, float side, ivec2 texel, vec2 reach, float shift, ve
     return lost;
 }
 
-float horizon_visibility(ivec2 texel, vec2 reach, vec3 point, vec3 normal, vec3 to_eye) {
+float horizon_visibility(ivec2 texel, vec2 reach, vec3 point, vec3 normal, vec3 to_eye, float depth, vec2 rise) {
     vec3 right = normalize(world_from_ndc[0].xyz), image_up = normalize(world_from_ndc[1].xyz);
     ivec2 cell = texel & (NOISE - 1);
     // Every texel of the square has another rotation, and neighbors differ in their rotation and in their shift.
@@ -258,8 +280,8 @@ float horizon_visibility(ivec2 texel, vec2 reach, vec3 point, vec3 normal, vec3 
         slice.normal_cosine = clamp(dot(projected_normal, to_eye) / max(projected_length, 1e-6), -1.0, 1.0);
         slice.normal_angle = fast_acos(slice.normal_cosine) * (dot(slice_axis, projected_normal) < 0.0 ? -1.0 : 1.0);
         slice.normal_sine = sin(slice.normal_angle);
-        lost += projected_length * (lost_arc(slice, -1.0, texel, reach, shift, point, to_eye)
-            + lost_arc(slice, 1.0, texel, reach, shift, point, to_eye));
+        lost += projected_length * (lost_arc(slice, -1.0, texel, reach, shift, point, to_eye, depth, rise)
+            + lost_arc(slice, 1.0, texel, reach, shift, point, to_eye, depth, rise));
         open += projected_length * (slice.normal_cosine + slice.normal_angle * slice.normal_sine);
     }
     // The slices are not uniform around the view ray, so that the open integral is not exactly 1.
@@ -279,7 +301,8 @@ void main() {
     if (here.depth > 0.0 && reach.y > 1.0) {
         // Moved along the normal by the rounding of f32, so that the surface does not occlude itself.
         vec3 point = here.depth * direction + (4e-6 * here.depth) * here.normal;
-        visibility = horizon_visibility(texel, reach, point, here.normal, -normalize(direction));
+        visibility = horizon_visibility(texel, reach, point, here.normal, -normalize(direction), here.depth,
+            (MAX_SLOPE * here.depth) * texel_side);
 #ifdef GROUND
         if (!here.is_ground && dot(eye, up) > ground_center.w) {
             float height = dot(point + eye, up) - ground_center.w;

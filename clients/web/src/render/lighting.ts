@@ -3,6 +3,7 @@
 import { type Lighting as LightingMessage, ToneMapping } from "../proto/modalcast/v1/scenes_pb";
 import { cross, dot, norm, type Vec3 } from "../scene/affine";
 import type { SceneDescription } from "../scene/description";
+import { at } from "../scene/numbers";
 
 export interface Lighting {
     toSun: Vec3;
@@ -105,6 +106,35 @@ function studioOf({ ambientCube, fill }: LightingMessage, skylight: Vec3): Studi
         ambientCube: [0, 3, 6, 9, 12, 15].map((first) => (ambientCube.length === 18 ? side(first) : skylight)),
         fill: fill.length === 3 ? (fill as Vec3) : [0, 0, 0],
     };
+}
+
+/** Whether color maps are drawn in front of the background of the scene. A blue sky would be confused with their colors. */
+export function keepsBackground({ studio }: Pick<Lighting, "studio">): boolean {
+    return studio !== null;
+}
+
+/** Displayed linear color of the ground near the scene or, without a ground, of the horizon. */
+export function groundColor(lighting: Lighting, axis: UpAxis): Vec3 {
+    const { ground, horizon, studio, skylight, sunlight, toSun } = lighting;
+    const ambient = studio?.ambientCube[2 * axis] ?? skylight;
+    const sine = Math.max(0, toSun[axis]);
+    return horizon.map((light, channel) => {
+        const lit = ground && at(ground, channel) * (at(ambient, channel) + sine * at(sunlight, channel));
+        return displayedOf(lit ?? light, lighting);
+    }) as Vec3;
+}
+
+/** The displayed linear value of a light, as in the shaders. */
+export function displayedOf(light: number, { exposure, tone }: Pick<Lighting, "exposure" | "tone">): number {
+    const x = light * exposure;
+    if (tone === 1) return x / (1 + x);
+    return Math.min(1, tone === 2 ? (x * (2.51 * x + 0.03)) / (x * (2.43 * x + 0.59) + 0.14) : x);
+}
+
+/** An sRGB color of CSS. */
+export function cssColor(linear: readonly number[]): string {
+    const encode = (value: number) => (value <= 0.0031308 ? 12.92 * value : 1.055 * value ** (1 / 2.4) - 0.055);
+    return `rgb(${linear.map((value) => Math.round(255 * encode(value))).join(" ")})`;
 }
 
 /** Largest value of f16, because the inverse of a tone curve may be infinite. */

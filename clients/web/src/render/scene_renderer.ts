@@ -11,7 +11,17 @@ import type { SceneState } from "../scene/state";
 import { AmbientOcclusion } from "./ambient_occlusion";
 import { Deformer, type DomainDisplay } from "./deformer";
 import { FullscreenPass } from "./fullscreen_pass";
-import { fitLightBox, type Lighting, lightAxes, lightingOf, lightOf, unitVector, upAxis } from "./lighting";
+import {
+    fitLightBox,
+    groundColor,
+    keepsBackground,
+    type Lighting,
+    lightAxes,
+    lightingOf,
+    lightOf,
+    unitVector,
+    upAxis,
+} from "./lighting";
 import { BACKGROUND_FRAGMENT, PLAIN_FRAGMENT } from "./shaders";
 import { Surfaces, type Uniforms } from "./surfaces";
 import { Transparency } from "./transparency";
@@ -35,7 +45,7 @@ export interface RenderOptions {
     background: BackgroundChoice;
 }
 
-/** Linear gray behind color maps, equal to the server's, and linear white. */
+/** Linear gray behind color maps unless the background stays, equal to the server's, and linear white. */
 const PLAIN_GRAY = 0.87;
 const WHITE = 1;
 
@@ -104,7 +114,10 @@ export class SceneRenderer {
         this.deformer.showMode(options.color.kind === "mode" ? options.color.mode : null);
         this.define("SHADOWS", this.options.shadows);
         this.define("STUDIO", this.lighting.studio !== null);
-        this.define("AMBIENT_OCCLUSION", this.ambientOcclusion !== null && !isMap);
+        const isPlain = options.background !== "scene" || (isMap && !keepsBackground(this.lighting));
+        this.surfaces.define("AMBIENT_OCCLUSION", this.ambientOcclusion !== null && !isMap);
+        this.background.define("AMBIENT_OCCLUSION", this.ambientOcclusion !== null);
+        this.background.define("COLOR_MAP", isMap);
         this.surfaces.setEdges(options.edges);
         if (!isMap) this.surfaces.setColorMode({ kind: "shaded" });
         // `Transparency` blends light and converts it to pixel colors.
@@ -114,7 +127,6 @@ export class SceneRenderer {
         // Color maps have no tone curve.
         this.setUniform(this.tone, "exposure", isMap ? 1 : this.lighting.exposure);
         this.setUniform(this.tone, "tone", isMap ? 0 : this.lighting.tone);
-        const isPlain = isMap || options.background !== "scene";
         this.background.mesh.visible = !isPlain;
         this.plain.mesh.visible = isPlain;
         this.plain.setUniform("plain", this.plainLight());
@@ -159,6 +171,12 @@ export class SceneRenderer {
         this.needsShadow = true;
     }
 
+    /** Displayed linear color of the background near the lower edge of the view. */
+    get backgroundColor(): Vec3 {
+        const plain = this.options.background === "white" ? WHITE : PLAIN_GRAY;
+        return this.plain.mesh.visible ? [plain, plain, plain] : groundColor(this.lighting, upAxis(this.scene));
+    }
+
     /** Near and far plane of a camera, so that they enclose all domains. */
     depthRange(camera: THREE.PerspectiveCamera): { near: number; far: number } {
         const view = camera.matrixWorldInverse.elements;
@@ -181,7 +199,7 @@ export class SceneRenderer {
     render(camera: THREE.PerspectiveCamera): void {
         this.prepare(camera);
         const { colorScene, blendScene, blendMaterials, ambientScene } = this.surfaces;
-        if (this.options.color.kind === "shaded") {
+        if (this.options.color.kind === "shaded" || this.background.mesh.visible) {
             if (this.options.shadows && this.needsShadow) this.renderShadow();
             this.ambientOcclusion?.render(ambientScene, camera);
         }

@@ -287,7 +287,7 @@ void main() {
 
 /**
  * Sky and ground behind all surfaces, as the server draws them.
- * Defines: SHADOWS, STUDIO, AMBIENT_OCCLUSION, GROUND, LINEAR_OUTPUT.
+ * Defines: SHADOWS, STUDIO, AMBIENT_OCCLUSION, GROUND, COLOR_MAP, LINEAR_OUTPUT.
  */
 export const BACKGROUND_FRAGMENT = `${PRECISION}
 in vec2 ndc;
@@ -324,7 +324,13 @@ void main() {
         light = mix(horizon, ground_light * ground.rgb, weight);
     }
 #endif
-    color = vec4(encode_pixel(apply_tone_curve(light)), 1.0);
+#ifdef COLOR_MAP
+    // Blended color maps have no tone curve.
+    light = displayed(light);
+#else
+    light = apply_tone_curve(light);
+#endif
+    color = vec4(encode_pixel(light), 1.0);
 }
 `;
 

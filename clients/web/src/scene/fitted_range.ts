@@ -1,6 +1,6 @@
 /** The end of a scale that fits the shown values without flickering. */
 
-import { niceAbove } from "./nice_numbers";
+import { fineAbove, niceAbove } from "./nice_numbers";
 
 /**
  * The scale shrinks to fit the values of the last two windows of this many milliseconds. Two windows contain both
@@ -15,7 +15,7 @@ const MARGIN = 1.1;
 const SMALLEST = 1e-5;
 
 export class FittedRange {
-    /** A nice number. */
+    /** A round number. */
     end: number;
     private readonly smallest: number;
     /** The largest values of the previous window and of the current one. */
@@ -33,9 +33,9 @@ export class FittedRange {
     update(value: number, now: number): boolean {
         const before = this.end;
         this.current = Math.max(this.current, value);
-        this.end = Math.max(this.end, niceAbove(value));
+        this.end = Math.max(this.end, fineAbove(value));
         if (now - this.windowStart >= WINDOW_MS) {
-            const fitting = niceAbove(MARGIN * Math.max(this.previous, this.current));
+            const fitting = fineAbove(MARGIN * Math.max(this.previous, this.current));
             // It does not shrink after the first value or a pause, because such a window has few values.
             if (now - this.windowStart < 2 * WINDOW_MS) this.end = Math.max(this.smallest, Math.min(this.end, fitting));
             this.previous = this.current;

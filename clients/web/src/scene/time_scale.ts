@@ -9,6 +9,8 @@ const WINDOW_MS = 10_000;
 const INTERVAL_MS = 50;
 /** Shortest time that gives a result. */
 const SHORTEST_MS = 1000;
+/** A ratio is shown for this many milliseconds after it has become unknown. */
+const RECENT_MS = 4000;
 /** After a pause of this many milliseconds the measurement begins again. */
 const LONGEST_PAUSE_MS = 1000;
 
@@ -40,6 +42,7 @@ export class TimeScale {
     private arrivals: Arrival[] = [];
     private last: Arrival | null = null;
     private run = 0n;
+    private recent: { ratio: number; now: number; run: bigint } | null = null;
 
     /** Adds a step that has arrived at `now`, in milliseconds. */
     add(step: StepId, now: number): void {
@@ -67,6 +70,17 @@ export class TimeScale {
         });
         const median = ratios.sort((a, b) => a - b)[ratios.length >> 1] ?? 0;
         return median > 0 && Number.isFinite(median) ? median : null;
+    }
+
+    /**
+     * The ratio, or the last one of the same run for some seconds: a busy page receives steps with pauses, after which
+     * the measurement begins again.
+     */
+    recentRatio(now: number): number | null {
+        const ratio = this.ratio(now);
+        if (ratio !== null) this.recent = { ratio, now, run: this.run };
+        const { recent } = this;
+        return recent && recent.run === this.run && now - recent.now <= RECENT_MS ? recent.ratio : null;
     }
 
     private hasPaused(now: number): boolean {

@@ -64,6 +64,14 @@ export type SurfaceForceMessage = {
     vector: number[];
 };
 
+/** A force on the coordinates of a domain. */
+export interface ModalForceMessage {
+    id: bigint;
+    domain: number;
+    /** f_q in f32, see ModalForce. */
+    fQ: Uint8Array;
+}
+
 export interface PickResult {
     head: PickHead | undefined;
     hits: Hit[];
@@ -205,13 +213,13 @@ export class Server {
     applyForces(
         scene: string,
         owner: Uint8Array,
-        forces: SurfaceForceMessage[],
+        forces: readonly (SurfaceForceMessage | ModalForceMessage)[],
         lifetimeMs: number,
     ): Promise<ApplyForcesResponse> {
-        const messages = forces.map(({ id, domain, triangle, barycentric, vector }) => ({
+        const messages = forces.map(({ id, domain, ...kind }) => ({
             id,
             domain,
-            kind: { case: "surface" as const, value: { triangle, barycentric, vector } },
+            kind: "fQ" in kind ? { case: "modal" as const, value: kind } : { case: "surface" as const, value: kind },
         }));
         const request = { scene, owner, forces: messages, lifetimeMs };
         return this.channel.unary(ForceService.method.applyForces, request, { timeoutMs: 5_000 });

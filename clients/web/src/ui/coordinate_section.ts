@@ -1,16 +1,20 @@
-/** The panel section with the modes of one domain: bars while a program drives the scene, sliders otherwise. */
+/** The panel section with the modes of one domain: sliders, or bars if sliders have no effect. */
 
+import { missingModes } from "../control/pull_problem";
 import { type Deflections, LARGEST_DEFLECTION } from "../scene/deflection";
 import { hertzOf, rankOf } from "../scene/description";
 import { FittedRange } from "../scene/fitted_range";
 import { niceBelow } from "../scene/nice_numbers";
 import { at } from "../scene/numbers";
+import { RecentPeak } from "../scene/recent_peak";
 import type { SceneModel } from "../scene/scene_model";
-import { h, setText } from "./dom";
+import type { SliderEffect } from "../session";
+import { h, setMarkedText, setText } from "./dom";
 import * as format from "./format";
 import { ModeRow } from "./mode_row";
 
-/** Modes shown at a time. */
+/** Modes that are shown at first, and after the user has asked for all. */
+const FIRST_MODES = 10;
 const MAX_MODES = 40;
 
 /** Highest animation frequency in hertz, and the animation frequency of modes whose frequency is unknown. */
@@ -24,6 +28,9 @@ export interface CoordinateHandlers {
     animate(domain: number, mode: number, amplitude: number, frequency: number): void;
     stop(): void;
     reset(domain: number): void;
+    /** Whether a force can hold a mode, and the coordinate at which forces hold it. */
+    canHold(domain: number, mode: number): boolean;
+    target(domain: number, mode: number): number;
 }
 
 export class CoordinateSection {
@@ -35,10 +42,17 @@ export class CoordinateSection {
     /** Deflection in meters at the ends of all bars. */
     private barRange = new FittedRange(0);
     private animated: number | null = null;
-    private canDrive = false;
+    private hintText = "";
+    private effect: SliderEffect = "none";
     private readonly select: HTMLSelectElement;
     private readonly largest = h("output", { id: "deflection" });
+    private readonly peak = h("span", { id: "peak", className: "hint" });
     private readonly largestRow: HTMLElement;
+    private readonly pulled = h("output", { id: "pulled-deflection" });
+    private readonly pulledRow: HTMLElement;
+    private recentPeak = new RecentPeak();
+    private showsAll = false;
+    private readonly showAll = h("button", { className: "outline" });
     private readonly ends = [h("span"), h("span", { textContent: "0" }), h("span")] as const;
     private readonly scale: HTMLElement;
     private readonly list = h("div", { className: "modes" });
@@ -60,8 +74,16 @@ export class CoordinateSection {
             h("label", { htmlFor: "q-domain", textContent: "Part", title: PART }),
             this.select,
         );
-        const label = h("label", { htmlFor: "deflection", textContent: "Deflection" });
-        this.largestRow = h("div", { className: "row" }, label, this.largest);
+        this.showAll.onclick = () => {
+            this.showsAll = !this.showsAll;
+            this.show(this.domain);
+            this.setAnimated(this.animated !== null);
+        };
+        const label = h("label", { htmlFor: "deflection", textContent: "Largest deflection" });
+        const values = h("span", { className: "values" }, this.largest, this.peak);
+        this.largestRow = h("div", { className: "row deflection" }, label, values);
+        const pulledLabel = h("label", { htmlFor: "pulled-deflection", textContent: "Pulled point" });
+        this.pulledRow = h("div", { className: "row deflection", hidden: true }, pulledLabel, this.pulled);
         this.scale = h("div", { className: "mode-scale" }, ...this.ends);
         this.element = h(
             "div",
@@ -69,9 +91,10 @@ export class CoordinateSection {
             this.row,
             this.hint,
             this.largestRow,
+            this.pulledRow,
             this.scale,
             this.list,
-            h("div", { className: "checks" }, this.reset),
+            h("div", { className: "checks" }, this.showAll, this.reset),
         );
     }
 
@@ -89,8 +112,7 @@ export class CoordinateSection {
                 .map((domain) => h("option", { value: String(domain.domain), textContent: domain.name })),
         );
         this.row.hidden = domains.length < 2;
-        this.reset.hidden = domains.length === 0;
-        setText(this.hint, domains.length === 0 && model ? "No part of this scene has modes." : "");
+        setMarkedText(this.hint, model ? missingModes(model.scene) : "");
         this.show(domains[0]?.domain ?? 0);
     }
 
@@ -102,26 +124,35 @@ export class CoordinateSection {
         this.rows = [];
         this.list.replaceChildren();
         this.largestRow.hidden = this.scale.hidden = rank === 0 || !deflections;
+        this.showAll.hidden = rank <= FIRST_MODES;
         if (!model || rank === 0) return;
         this.domain = at(model.layout.owner, domain);
         this.select.value = String(this.domain);
         const size = deflections?.size(this.domain) ?? 0;
         this.barRange = new FittedRange(size);
+        this.recentPeak = new RecentPeak();
         this.scale.title = `The sliders end at up to ${100 * LARGEST_DEFLECTION} % of the part's size of ${format.meters(size)}.`;
-        this.rows = Array.from({ length: Math.min(rank, MAX_MODES) }, (_, mode) => this.createRow(model, mode));
+        const count = Math.min(rank, MAX_MODES);
+        setText(this.showAll, this.showsAll ? `Show ${FIRST_MODES} modes` : `Show all ${count} modes`);
+        const length = this.showsAll ? count : Math.min(rank, FIRST_MODES);
+        this.rows = Array.from({ length }, (_, mode) => this.createRow(model, mode));
         this.list.append(...this.rows.map((row) => row.element));
-        if (rank > MAX_MODES)
+        if (this.showsAll && rank > MAX_MODES)
             this.list.append(h("p", { className: "hint", textContent: `and ${rank - MAX_MODES} more` }));
-        this.setCanDrive(this.canDrive);
-        this.update();
+        this.setEffect(this.effect);
+        this.update(null);
     }
 
-    /** Shows sliders if this viewer can drive the scene, otherwise bars. */
-    setCanDrive(canDrive: boolean, hint = ""): void {
-        this.canDrive = canDrive;
-        for (const row of this.rows) row.setCanDrive(canDrive);
-        this.reset.disabled = !canDrive;
-        if (this.rows.length > 0) setText(this.hint, hint);
+    /** Shows sliders if they have an effect, otherwise bars. Without `hint`, the hint stays. */
+    setEffect(effect: SliderEffect, hint = this.hintText): void {
+        this.effect = effect;
+        this.hintText = hint;
+        for (const row of this.rows) {
+            const canHold = effect === "forces" && this.handlers.canHold(this.domain, row.mode);
+            row.setControls(effect === "steps" || canHold, effect === "steps");
+        }
+        this.reset.hidden = effect === "none" || this.rows.length === 0;
+        if (this.rows.length > 0) setMarkedText(this.hint, hint);
         this.hint.hidden = !this.hint.textContent;
     }
 
@@ -130,8 +161,12 @@ export class CoordinateSection {
         for (const row of this.rows) row.setAnimated(this.animated === row.mode);
     }
 
-    /** Shows the current coordinates if the section is visible. */
-    update(): void {
+    /**
+     * Shows the current coordinates if the section is visible.
+     *
+     * @param pulled Deflection of the pulled point in meters; null without a pull.
+     */
+    update(pulled: number | null): void {
         const { model, deflections } = this;
         if (!model || this.rows.length === 0 || !this.list.checkVisibility()) return;
         const q = model.state.qOf(this.domain);
@@ -139,18 +174,29 @@ export class CoordinateSection {
             (largest, { mode, metersPerQ }) => Math.max(largest, Math.abs(at(q, mode)) * metersPerQ),
             0,
         );
-        this.barRange.update(largestOfModes, performance.now());
-        const end = this.canDrive ? Math.max(this.sliderEnd, largestOfModes) : this.barRange.end;
+        const now = performance.now();
+        this.barRange.update(largestOfModes, now);
+        // Sliders reach at least their end, and do not flicker while physics moves the modes.
+        const shown = this.effect === "steps" ? largestOfModes : this.barRange.end;
+        const end = this.effect === "none" ? shown : Math.max(this.sliderEnd, shown);
         setText(this.ends[0], format.signedMeters(-end));
         setText(this.ends[2], format.signedMeters(end));
         for (const row of this.rows) {
             const value = at(q, row.mode);
-            row.update(value, row.metersPerQ > 0 ? end / row.metersPerQ : Math.max(1, Math.abs(value)));
+            const target = this.effect === "forces" ? this.handlers.target(this.domain, row.mode) : value;
+            row.update(value, row.metersPerQ > 0 ? end / row.metersPerQ : Math.max(1, Math.abs(value)), target);
         }
         if (!deflections) return;
         const isExact = deflections.isExact(this.domain);
         const count = format.count(deflections.count(this.domain));
-        setText(this.largest, `${isExact ? "" : "about "}${format.meters(deflections.largest(this.domain))}`);
+        const about = isExact ? "" : "about ";
+        const largest = deflections.largest(this.domain);
+        const peak = this.recentPeak.add(largest, now);
+        setText(this.largest, `${about}${format.meters(largest)}`);
+        setText(this.peak, `peak ${format.meters(peak)}`);
+        this.peak.hidden = this.effect === "steps" || peak === 0;
+        this.pulledRow.hidden = pulled === null;
+        setText(this.pulled, format.meters(pulled ?? 0));
         this.largest.title = `The largest distance of the part from its undeformed shape, at ${isExact ? "all" : "a selection of"} ${count} vertices.`;
     }
 

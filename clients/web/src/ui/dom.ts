@@ -29,6 +29,21 @@ export function byId<T extends Element = HTMLElement>(id: string): T {
     return element as unknown as T;
 }
 
+const markedTexts = new WeakMap<Element, string>();
+
+/** Sets a text in which backticks enclose commands, only if it differs. */
+export function setMarkedText(element: Element, text: string): void {
+    if (markedTexts.get(element) === text) return;
+    markedTexts.set(element, text);
+    const parts = text.split("`").map((part, place) => (place % 2 === 0 ? part : code(part)));
+    element.replaceChildren(...parts);
+}
+
+/** A short text without spaces is not broken at its hyphens. */
+function code(text: string): HTMLElement {
+    return h("code", { className: text.includes(" ") ? "" : "word", textContent: text });
+}
+
 /** Sets text only if it differs, so that unchanged panels cause no layout. */
 export function setText(element: Element, text: string): void {
     if (element.textContent !== text) element.textContent = text;

@@ -27,14 +27,17 @@ export class ForceLines {
 
     draw(camera: OrbitCamera): void {
         if (!this.session) return;
-        const { model, pull, source } = this.session;
+        const { model, pull, source, deflections } = this.session;
         const lines: OverlayLine[] = [];
         const add = (from: Vec3, to: Vec3, text: string, isOwn: boolean) => {
             const [start, end] = [camera.project(from), camera.project(to)];
             if (start && end) lines.push({ from: start, to: end, text, isOwn });
         };
         const view = pull?.view;
-        if (view) add(view.from, view.to, pullText(view), true);
+        if (view && pull?.grabbed) {
+            const largest = deflections?.largest(pull.grabbed.domain) ?? null;
+            add(view.from, view.to, pullText(view, largest), true);
+        }
         for (const { owner, force } of model.forces) {
             if (force?.kind.case !== "surface" || owner === pull?.ownerNumber) continue;
             const { triangle, barycentric, vector } = force.kind.value;
@@ -53,8 +56,14 @@ export class ForceLines {
     }
 }
 
-/** The force and its limit, the deflection of the point and, at the limit, the reason for the limit. */
-function pullText({ newtons, limit, deflection, isLimited }: PullView): string {
-    const reason = isLimited ? `\nThe limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.` : "";
-    return `${format.limitedNewtons(newtons, limit)}\n${format.meters(deflection)}${reason}`;
+/**
+ * The force and its limit, deflections of the point and of the part, and the reason for the limit if it is reached.
+ *
+ * @param largest Largest deflection of the part in meters; null if it is unknown.
+ */
+function pullText({ newtons, limit, deflection, isLimited }: PullView, largest: number | null): string {
+    const lines = [format.limitedNewtons(newtons, limit), `${format.meters(deflection)} at the pulled point`];
+    if (largest !== null) lines.push(`${format.meters(largest)} largest`);
+    if (isLimited) lines.push(`The limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.`);
+    return lines.join("\n");
 }

@@ -10,7 +10,7 @@ export function short(value: number): string {
 }
 
 export function meters(value: number): string {
-    if (value === 0) return "0 m";
+    if (value === 0) return "0";
     const size = Math.abs(value);
     if (size < 1e-6) return `${short(value * 1e9)} nm`;
     if (size < 1e-3) return `${short(value * 1e6)} µm`;

@@ -50,10 +50,10 @@ export class ModeRow {
         this.element = h("div", { className: "mode" }, name, this.value, this.play, track, this.slider);
     }
 
-    /** Shows a slider on the bar if this viewer can drive the scene. */
-    setCanDrive(canDrive: boolean): void {
-        this.slider.hidden = !canDrive;
-        this.play.disabled = !canDrive;
+    /** Shows a slider on the bar, and a button that animates the mode. */
+    setControls(hasSlider: boolean, canAnimate: boolean): void {
+        this.slider.hidden = !hasSlider;
+        this.play.hidden = !canAnimate;
     }
 
     setAnimated(isAnimated: boolean): void {
@@ -62,8 +62,11 @@ export class ModeRow {
         this.play.replaceChildren(icon(isAnimated ? "pause" : "wave"));
     }
 
-    /** @param end q at the ends of the track. */
-    update(q: number, end: number): void {
+    /**
+     * @param end q at the ends of the track.
+     * @param target q of the slider, which differs from q while a force moves the mode.
+     */
+    update(q: number, end: number, target = q): void {
         const text = this.deflectionText(q);
         setText(this.value, text);
         this.value.title = `q[${this.mode}] = ${format.short(q)}, counted from 0 as in programs`;
@@ -72,8 +75,8 @@ export class ModeRow {
         const isEdited = slider.matches(":active") || performance.now() - this.lastInput < INPUT_MS;
         if (document.activeElement === slider && isEdited) return;
         this.end = end;
-        slider.value = String((STEPS * q) / end);
-        slider.setAttribute("aria-valuetext", text);
+        slider.value = String((STEPS * target) / end);
+        slider.setAttribute("aria-valuetext", this.deflectionText(target));
     }
 
     private deflectionText(q: number): string {

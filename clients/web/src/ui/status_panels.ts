@@ -13,6 +13,7 @@ import * as format from "./format";
 import { Legend } from "./legend";
 import { modeName } from "./mode_row";
 import type { Panel } from "./panel";
+import { isPhone, pullHintText } from "./pull_hint";
 import { RateMeter } from "./rate_meter";
 import type { Settings } from "./settings";
 
@@ -72,18 +73,19 @@ export class StatusPanels {
         this.performance.set({
             "Frames drawn": `${rate.toFixed(0)} /s`,
             "Steps received": `${this.stateRate.perSecond().toFixed(0)} /s`,
-            "Steps skipped": format.count(settings.pictures ? (pictures?.skipped ?? 0n) : model.counts.skipped),
+            "Steps not shown": format.count(settings.pictures ? (pictures?.skipped ?? 0n) : model.counts.skipped),
             Received: `${format.bytes(this.byteRate.perSecond())}/s`,
             "Bytes of the last step": format.bytes(
                 settings.pictures ? (pictures?.lastFrameBytes ?? 0) : model.lastStateBytes,
             ),
             "Round trip": source.server ? `${this.latency.toFixed(1)} ms` : null,
-            "Error of this view": this.errorText({ model, renderer }),
+            "Position error": this.errorText({ model, renderer }),
+            Pictures: settings.pictures ? (settings.jpeg ? "JPEG, with losses" : "PNG, exact") : null,
             "Storage of modes": renderer && model.layout.coordinates > 0 ? storage : null,
             "Graphics memory": renderer ? format.bytes(renderer.deformer.bytes + meshBytes(model.scene)) : null,
             Step: step ? `${step.number} at ${format.seconds(step.time)}` : "rest state",
             "Time scale": this.timeScale === null ? null : format.timeScale(this.timeScale),
-            Stages:
+            "Server, per step":
                 stages.length > 0
                     ? `${stages.map(({ stage, milliseconds }) => `${stage} ${milliseconds.toFixed(2)}`).join(", ")} ms`
                     : null,
@@ -95,10 +97,9 @@ export class StatusPanels {
     }
 
     private errorText({ model, renderer }: Pick<SceneSession, "model" | "renderer">): string | null {
-        const { settings } = this;
-        if (settings.pictures) return settings.jpeg ? "JPEG" : "none (PNG)";
-        if (!renderer || model.layout.coordinates === 0) return null;
-        return `at most ${format.meters(renderer.errorBound())}`;
+        if (this.settings.pictures || !renderer || model.layout.coordinates === 0) return null;
+        const bound = renderer.errorBound();
+        return bound === 0 ? "none at rest" : `at most ${format.meters(bound)}`;
     }
 
     private updateLegend({ renderer, colorScale, model }: SceneSession): void {
@@ -109,18 +110,23 @@ export class StatusPanels {
         this.legend.show(`${name}: part of its largest deflection`, "100 %");
     }
 
-    private updateForces({ model, pull, source }: SceneSession): void {
+    private updateForces({ model, pull, modeForces, source }: SceneSession): void {
         this.panel.setCount("Forces", model.forces.length > 0 ? String(model.forces.length) : "");
         if (model.forces.length === 0) {
-            setText(this.forces, source.features.forces ? "Nobody pulls. Drag with Shift to pull." : "Nobody pulls.");
+            const gesture = source.features.forces ? ` ${pullHintText(isPhone())}` : "";
+            setText(this.forces, `Nobody pulls.${gesture}`);
             return;
         }
         const text = model.forces.map(({ owner, force }) => {
-            const isOwn = owner === pull?.ownerNumber;
+            const isOwn = owner === pull?.ownerNumber || owner === modeForces?.ownerNumber;
             const newtons = force?.kind.case === "surface" ? norm(force.kind.value.vector as Vec3) : null;
             const limit = (isOwn ? pull?.view?.limit : undefined) ?? null;
             const size =
-                newtons === null ? "modal" : isOwn ? format.limitedNewtons(newtons, limit) : format.newtons(newtons);
+                newtons === null
+                    ? "modes held"
+                    : isOwn
+                      ? format.limitedNewtons(newtons, limit)
+                      : format.newtons(newtons);
             const who = isOwn ? "you" : `viewer ${owner}`;
             return `${who}: ${size} on ${model.scene.domains[force?.domain ?? 0]?.name ?? "?"}`;
         });

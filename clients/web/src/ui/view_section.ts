@@ -1,8 +1,15 @@
 /** The panel section that selects whether the browser or the server draws, and what. */
 
+import { keepsBackground, type Lighting } from "../render/lighting";
 import type { BackgroundChoice } from "../render/scene_renderer";
 import { h, setText } from "./dom";
 import type { Settings } from "./settings";
+
+/** The background of a scene, in words. */
+export function backgroundName({ studio, ground }: Pick<Lighting, "studio" | "ground">): string {
+    if (studio) return "Studio";
+    return ground ? "Sky and ground" : "Sky";
+}
 
 export class ViewSection {
     readonly element: HTMLElement;
@@ -16,7 +23,9 @@ export class ViewSection {
     private readonly edges: HTMLInputElement;
     private readonly shadows: HTMLInputElement;
     private readonly background: HTMLSelectElement;
+    private readonly ownBackground = h("option", { value: "scene", textContent: "Sky and ground" });
     private readonly jpeg: HTMLSelectElement;
+    private mapsKeepBackground = false;
     private readonly switchRow: HTMLElement;
     onChange: () => void = () => {};
 
@@ -65,7 +74,7 @@ export class ViewSection {
         this.background = h(
             "select",
             { id: "background" },
-            h("option", { value: "scene", textContent: "Sky and ground" }),
+            this.ownBackground,
             h("option", { value: "gray", textContent: "Light gray" }),
             h("option", { value: "white", textContent: "White" }),
         );
@@ -105,6 +114,13 @@ export class ViewSection {
         this.refresh();
     }
 
+    /** Names the background of a scene, and whether color maps keep it. */
+    setBackground(lighting: Pick<Lighting, "studio" | "ground">): void {
+        setText(this.ownBackground, backgroundName(lighting));
+        this.mapsKeepBackground = keepsBackground(lighting);
+        this.refresh();
+    }
+
     setModes(largestRank: number): void {
         this.mode.max = String(Math.max(1, largestRank));
         for (const option of this.color.options) option.disabled = option.value !== "shaded" && largestRank === 0;
@@ -128,7 +144,7 @@ export class ViewSection {
         this.hint.hidden = !this.hint.textContent;
         this.modeRow.hidden = settings.color.kind !== "mode";
         this.jpegRow.hidden = !settings.pictures;
-        this.shadows.disabled = settings.pictures || settings.color.kind !== "shaded";
+        this.shadows.disabled = settings.pictures || (settings.color.kind !== "shaded" && !this.mapsKeepBackground);
         // The server draws the background of its pictures.
         this.background.disabled = settings.pictures;
         this.edges.checked = settings.edges;

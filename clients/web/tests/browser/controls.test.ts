@@ -69,7 +69,7 @@ test("sliders and animated modes drive a scene that nobody else drives", { timeo
         if (simulation.exitCode !== null) simulation = startSimulation(server, ["--scene", "tree"]);
     }
     await slider.waitFor({ state: "hidden" });
-    assert.ok(await page.getByText("A physics process controls this scene.").isVisible());
+    assert.ok(await page.getByText("Another program moves this model and accepts no forces.").isVisible());
     await end(simulation);
     await slider.waitFor();
     assert.deepEqual(errors, []);
@@ -112,7 +112,7 @@ test("keys switch edges, shadows, colors, panels, the pull tool and help", { tim
         ),
     );
     const panels = (await page.locator("#panel").textContent()) ?? "";
-    assert.match(panels, /Modes.*Deflection.*Parts/s);
+    assert.match(panels, /Modes.*Largest deflection.*Parts/s);
     for (const text of [...titles, panels])
         assert.doesNotMatch(text.replace("Programs call it a domain.", ""), /domain|remark|lease|displacement/i);
     // Control: letters in a text field are text.

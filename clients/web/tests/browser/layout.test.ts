@@ -128,6 +128,64 @@ test("legend, scale bar and buttons do not cover each other", { timeout: LIMIT_M
     }
 });
 
+test("a message is one line in the corner until it is opened", { timeout: LIMIT_MS }, async () => {
+    for (const [name, [width, height]] of [
+        ["desktop", DESKTOP],
+        ["phone", PHONE],
+    ] as const) {
+        const { page } = await setup.open(width, height);
+        await page.evaluate(() => {
+            modalcastViewer.notices.show("short", "A short message.");
+            const action = { label: "Do something", run: () => {} };
+            modalcastViewer.notices.show("long", "A sentence that is repeated. ".repeat(12), { duration: 0, action });
+        });
+        const notice = page.locator(".notice", { hasText: "repeated" });
+        const more = notice.getByRole("button", { name: "More" });
+        await more.waitFor();
+        await takeScreenshot(page, `layout-messages-${name}`);
+        const short = page.locator(".notice", { hasText: "short" });
+        assert.equal(await short.getByRole("button", { name: "More" }).isVisible(), false, "control: it fits");
+        const [box, bar] = [await elementBox(page, "#notices"), await elementBox(page, "#bar")];
+        assert.ok(box.top >= bar.bottom && box.bottom < 0.25 * height, `${name}: ${JSON.stringify(box)}`);
+        const axes = await elementBox(page, "#axes");
+        const lines = await elementBox(page, ".notice:last-child");
+        assert.ok(name === "phone" || lines.right <= axes.left, `${name}: expected uncovered axes`);
+        await more.click();
+        assert.ok((await elementBox(page, "#notices")).bottom > box.bottom + 30, "expected several lines");
+        assert.ok(await notice.getByRole("button", { name: "Do something" }).isVisible());
+        await notice.getByRole("button", { name: "Less" }).click();
+        assert.equal((await elementBox(page, "#notices")).bottom, box.bottom);
+        await page.close();
+    }
+});
+
+test("the page has the color of the ground behind the sheet of a phone", { timeout: LIMIT_MS }, async () => {
+    const { page } = await setup.open(...PHONE);
+    const colors = await page.evaluate(
+        () =>
+            new Promise<number[][]>((done) => {
+                const { viewport } = modalcastViewer;
+                viewport.onDrawn = () => {
+                    viewport.onDrawn = () => {};
+                    const gl = viewport.gl?.getContext() as WebGL2RenderingContext;
+                    const pixels = [1, viewport.pixelSize[1] - 1].map((y) => {
+                        const color = new Uint8Array(4);
+                        gl.readPixels(1, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, color);
+                        return [...color].slice(0, 3);
+                    });
+                    const page = getComputedStyle(document.body).backgroundColor.match(/\d+/g)?.map(Number) ?? [];
+                    done([page, ...pixels]);
+                };
+                viewport.invalidate();
+            }),
+    );
+    const [body = [], ground = [], sky = []] = colors;
+    const difference = (other: number[]) => Math.max(...body.map((value, i) => Math.abs(value - (other[i] ?? 0))));
+    assert.ok(difference(ground) <= 16, `expected ${ground}, got ${body}`);
+    assert.ok(difference(sky) > 40, `control: another color than the sky ${sky}, got ${body}`);
+    await page.close();
+});
+
 test("a view that the user has turned stays when the page changes its size", { timeout: LIMIT_MS }, async () => {
     const { page, errors } = await setup.open(...PHONE);
     const eye = () => page.evaluate(() => modalcastViewer.viewport.camera.eye);

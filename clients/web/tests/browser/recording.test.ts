@@ -57,7 +57,7 @@ async function record(): Promise<void> {
     await server.start();
     const client = await server.client();
     await client.openScene("tree");
-    const simulation = startSimulation(server, ["--scene", "tree", "--wind", "1", "--forces"]);
+    const simulation = startSimulation(server, ["--scene", "tree", "--wind", "8", "--forces"]);
     const options = ["record", "tree", "--out", file, "--server", server.grpcUrl, "--steps", "120"];
     const recorder = runProgram("modalcast-record", options);
     let states = 0;

@@ -227,7 +227,7 @@ test("a pull bends a branch, which returns afterwards", { timeout: LIMIT_MS }, a
     await page.keyboard.down("Shift");
     await page.mouse.move(...(await leafPixel(page)));
     await page.mouse.down();
-    await page.locator(".notice", { hasText: "Nobody receives forces" }).waitFor();
+    await page.locator(".notice", { hasText: "no physics is running" }).waitFor();
     await page.mouse.up();
     const simulation = startSimulation(server, ["--scene", "tree", "--wind", "0", "--forces"]);
     try {

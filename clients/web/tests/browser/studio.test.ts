@@ -140,6 +140,68 @@ test("the default camera views a part from the server's direction", { timeout: L
     }
 });
 
+/** Colors of pixels of the background, which is drawn anew: above, beside and below the part. */
+function background(page: Page): Promise<number[][]> {
+    return page.evaluate(
+        () =>
+            new Promise<number[][]>((done) => {
+                const { viewport } = modalcastViewer;
+                viewport.onDrawn = () => {
+                    viewport.onDrawn = () => {};
+                    const gl = viewport.gl?.getContext() as WebGL2RenderingContext;
+                    const [width, height] = viewport.pixelSize;
+                    const places = [
+                        [width / 2, height - 4],
+                        [4, height / 2],
+                        [width / 2, 4],
+                        [4, 4],
+                    ] as const;
+                    const colors = places.map(([x, y]) => {
+                        const color = new Uint8Array(4);
+                        gl.readPixels(x, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, color);
+                        return [...color];
+                    });
+                    done(colors);
+                };
+                viewport.invalidate();
+            }),
+    );
+}
+
+test("color maps keep the background of a studio, which the page names", { timeout: LIMIT_MS }, async () => {
+    for (const [scene, name, isKept] of [
+        ["studio", "Studio", true],
+        ["outdoor", "Sky and ground", false],
+    ] as const) {
+        const { page, errors } = await open(scene, "CPU");
+        const option = page.locator("#background option").first();
+        assert.equal(await option.textContent(), name);
+        const show = (kind: "shaded" | "displacement", edges: boolean) =>
+            page.evaluate(
+                ([color, isOn]) =>
+                    modalcastViewer.change(() => {
+                        Object.assign(modalcastViewer.settings, { color: { kind: color }, edges: isOn });
+                    }),
+                [kind, edges] as const,
+            );
+        const expected = await background(page);
+        for (const edges of [false, true]) {
+            await show("displacement", edges);
+            const found = await background(page);
+            const difference = Math.max(
+                ...found.flatMap((color, place) =>
+                    color.map((value, channel) => Math.abs(value - (expected[place]?.[channel] ?? 0))),
+                ),
+            );
+            if (isKept) assert.ok(difference <= 1, `edges ${edges}: expected the background, got ${difference}`);
+            else assert.ok(difference > 20, `control: expected another background, got ${difference}`);
+        }
+        await takeScreenshot(page, `studio-map-${scene}`);
+        assert.deepEqual(errors, []);
+        await page.close();
+    }
+});
+
 /** Sources of the programs of WebGL that a page has compiled, with their macros. */
 function programKeys(page: Page): Promise<string[]> {
     return page.evaluate(() => modalcastViewer.viewport.gl?.info.programs?.map((program) => program.cacheKey) ?? []);

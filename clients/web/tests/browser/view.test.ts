@@ -91,7 +91,7 @@ function upperPixel(page: Page): Promise<[number, number]> {
     });
 }
 
-/** The color map of deflections ends at a round number that is at most 5 / 2 times the largest recent deflection. */
+/** The color map of deflections ends at a round number that is at most 4 / 3 times the largest recent deflection. */
 async function checkColorRange(page: Page): Promise<void> {
     await page.keyboard.press("m");
     const legend = page.locator("#legend .ends span").nth(1);
@@ -101,7 +101,10 @@ async function checkColorRange(page: Page): Promise<void> {
         return { end: colorScale?.end ?? 0, largest: deflections?.largestOfScene() ?? 0 };
     });
     assert.ok(scale.end >= scale.largest && scale.end < 0.1, JSON.stringify(scale));
-    assert.match((await legend.textContent()) ?? "", /^[125]0{0,2} mm$/);
+    assert.match(
+        (await legend.textContent()) ?? "",
+        /^(?:1|1\.2|1\.5|2|2\.5|[34568]|1[025]|2[05]|[34568]0|1[025]0|2[05]0|[34568]00) mm$/,
+    );
     await page.keyboard.press("m");
     await page.locator("#legend", { hasText: "Mode 1, 1 Hz: part of its largest deflection" }).waitFor();
     await page.keyboard.press("m");
@@ -120,8 +123,9 @@ async function checkForceLimit(page: Page, [x, y]: [number, number]): Promise<vo
     const pull = await view();
     const [newtons, limit] = [pull?.newtons ?? 0, pull?.limit ?? 0];
     assert.ok(Math.abs(newtons / limit - 1) < 1e-9, `expected ${limit} N, got ${newtons} N`);
-    assert.match((await text(1)) ?? "", /mm$/);
-    assert.equal(await text(2), "The limit bends the part by 10 % of its size.");
+    assert.match((await text(1)) ?? "", /mm at the pulled point$/);
+    assert.match((await text(2)) ?? "", /mm largest$/);
+    assert.equal(await text(3), "The limit bends the part by 10 % of its size.");
     const [label, stage] = await page.evaluate(() =>
         ["#overlay text", "#stage"].map(
             (selector) => document.querySelector(selector)?.getBoundingClientRect().right ?? 0,
@@ -197,11 +201,19 @@ test("the modes of a surface are computed, and the part is pulled", { timeout: L
     process.env["XDG_CACHE_HOME"] = temporaryFolder();
     // The first frequency of the beam is about 2.7 Hz.
     const material = ["--material", "E=2e7,nu=0.3,rho=1000", "--damping", "0.05"];
-    const modeling = ["--modes", "4", ...material, "--clamp", "z < 0.05", "--freedoms", "5000"];
+    const modeling = ["--modes", "12", ...material, "--clamp", "z < 0.05", "--freedoms", "5000"];
     const shown = await view("beam.stl", new Beam().stl(), modeling);
     const { page } = shown;
     await page.waitForFunction(() => modalcastViewer.status.stateRate.perSecond() > 5);
-    assert.equal((await coordinates(page)).length, 4);
+    assert.equal((await coordinates(page)).length, 12);
+    // The panel shows ten modes at first, each with its bar.
+    const bars = page.locator(".mode .track");
+    assert.equal(await bars.count(), 10);
+    await page.getByRole("button", { name: "Show all 12 modes" }).click();
+    assert.equal(await bars.count(), 12);
+    assert.ok(await bars.evaluateAll((all) => all.every((bar) => bar.getBoundingClientRect().height > 0)));
+    assert.equal(await page.locator(".modes").evaluate((list) => list.scrollHeight - list.clientHeight), 0);
+    await page.getByRole("button", { name: "Show 10 modes" }).click();
     assert.equal(Math.hypot(...(await coordinates(page))), 0, "expected no motion without a pull");
     await takeScreenshot(page, "view-stl-at-rest");
     const [x, y] = await upperPixel(page);
@@ -231,7 +243,7 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     await notice.waitFor({ state: "hidden" });
     const remarks = await page.locator("ul.remarks li").allTextContents();
     assert.match(remarks[0] ?? "", /^material library 'absent.mtl' does not exist: the default color is drawn/);
-    assert.match(remarks[1] ?? "", /^the scene is 200 x 200 x 0 m; if its file is in millimeters, pass --unit mm/);
+    assert.match(remarks[1] ?? "", /^The model is 200 x 200 x 0 m large.*modalcast view triangle.obj --unit mm$/);
     assert.equal(remarks.length, 2);
     assert.equal(await page.locator("ul.remarks").isVisible(), true);
     await takeScreenshot(page, "view-remarks");
@@ -240,6 +252,119 @@ test("remarks on the files are a message and a list", { timeout: LIMIT_MS }, asy
     assert.equal(await plain.page.locator(".notice").count(), 0, "control");
     assert.equal(await plain.page.locator("summary", { hasText: "Notes on files" }).isVisible(), false, "control");
     await close(plain);
+});
+
+/** Begins a pull on the beam. */
+async function press(page: Page): Promise<void> {
+    await page.keyboard.down("Shift");
+    await page.mouse.move(...(await upperPixel(page)));
+    await page.mouse.down();
+    await page.waitForFunction(() => modalcastViewer.pull?.view != null);
+}
+
+async function release(page: Page): Promise<void> {
+    await page.mouse.up();
+    await page.keyboard.up("Shift");
+}
+
+/** q of the first mode: its mean over some time, and the largest distance from the mean. */
+async function vibration(page: Page, milliseconds: number): Promise<{ mean: number; amplitude: number }> {
+    const values: number[] = [];
+    for (const limit = performance.now() + milliseconds; performance.now() < limit; ) {
+        values.push((await coordinates(page))[0] ?? Number.NaN);
+        await page.waitForTimeout(20);
+    }
+    const mean = values.reduce((sum, value) => sum + value, 0) / values.length;
+    return { mean, amplitude: Math.max(...values.map((value) => Math.abs(value - mean))) };
+}
+
+test("a slider holds a mode while physics is running", { timeout: LIMIT_MS }, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("fork.npz", new Beam().npz([eigenvalue(206), eigenvalue(300)]));
+    const { page } = shown;
+    const slider = page.getByRole("slider", { name: "Mode 1", exact: true });
+    await slider.waitFor();
+    await page.locator("#time-scale", { hasText: "1/100 of real time" }).waitFor();
+    await page.locator("#panel .hint", { hasText: "holds a mode by a constant force" }).waitFor();
+    assert.equal((await vibration(page, 500)).mean, 0, "control: at rest without a force");
+    const play = page.getByRole("button", { name: "Animate mode 1", exact: true });
+    assert.equal(await play.isVisible(), false, "only steps of this viewer animate a mode");
+    // One step from the middle is 0.5 mm, and a corner moves by 1.007 m per unit of q.
+    await slider.focus();
+    for (let press = 0; press < 60; press++) await page.keyboard.press("ArrowRight");
+    const target = 0.03 / 1.007;
+    for (;;) {
+        const { mean, amplitude } = await vibration(page, 1500);
+        if (Math.abs(mean / target - 1) < 0.05 && amplitude < 0.1 * target) break;
+    }
+    assert.equal(await slider.inputValue(), "60");
+    await page.getByText("you: modes held on fork").waitFor({ state: "attached" });
+    await takeScreenshot(page, "view-held-mode");
+    await page.getByRole("button", { name: "Set all to 0" }).click();
+    await page.waitForFunction(() => modalcastViewer.model?.forces.length === 0);
+    for (;;) {
+        const { mean, amplitude } = await vibration(page, 1500);
+        if (Math.abs(mean) < 0.05 * target && amplitude < 0.1 * target) break;
+    }
+    assert.equal(await slider.inputValue(), "0");
+    // A hint says how to pull, until the first pull of this browser.
+    const hint = page.locator(".notice", { hasText: "Shift + drag pulls on the model." });
+    await hint.waitFor();
+    await press(page);
+    await hint.waitFor({ state: "hidden" });
+    await release(page);
+    assert.equal(await page.evaluate(() => localStorage.getItem("modalcast.has-pulled")), "1");
+    await close(shown);
+});
+
+test("a phone has a hint at the tool that pulls", { timeout: LIMIT_MS }, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("fork.npz", new Beam().npz([eigenvalue(206), eigenvalue(300)]));
+    const { page } = shown;
+    await page.setViewportSize({ width: 390, height: 844 });
+    await page.reload({ waitUntil: "commit" });
+    await waitForScene(page);
+    const hint = page.locator(".notice", { hasText: "To pull: tap the arrow below, then drag." });
+    await hint.waitFor();
+    await takeScreenshot(page, "view-phone-hint");
+    await page.getByRole("button", { name: "Pull on the surface" }).click();
+    await page.mouse.move(...(await upperPixel(page)));
+    await page.mouse.down();
+    await hint.waitFor({ state: "hidden" });
+    await page.mouse.up();
+    // Control: the next page of this browser has no hint.
+    await page.reload({ waitUntil: "commit" });
+    await waitForScene(page);
+    await page.waitForFunction(() => modalcastViewer.session?.modeForces?.hasReceiver);
+    await page.waitForTimeout(500);
+    assert.equal(await page.locator(".notice").count(), 0);
+    await close(shown);
+});
+
+test("a pull without physics names a command that starts it", { timeout: LIMIT_MS }, async () => {
+    const eigenvalue = (hertz: number) => (2 * Math.PI * hertz) ** 2;
+    const shown = await view("fork.npz", new Beam().npz([eigenvalue(206), eigenvalue(300)]), ["--no-sim"]);
+    const { page } = shown;
+    await page.locator("#panel .hint", { hasText: "a pull has no effect" }).waitFor();
+    assert.equal(await page.locator(".notice").count(), 0, "expected no hint at a pull without effect");
+    await press(page);
+    const notice = page.locator(".notice", { hasText: "no physics is running" });
+    await notice.waitFor();
+    await release(page);
+    // One line in the corner until the user opens it.
+    const height = async () => (await notice.boundingBox())?.height ?? 0;
+    assert.ok((await height()) < 40, `expected one line, got ${await height()}`);
+    await notice.getByRole("button", { name: "More" }).click();
+    assert.ok((await height()) > 60, `expected several lines, got ${await height()}`);
+    await takeScreenshot(page, "view-no-physics");
+    const [name = "", ...options] = ((await notice.locator("code").last().textContent()) ?? "").split(" ");
+    assert.equal(name, "modalcast-sim");
+    await notice.getByRole("button", { name: "Close this message" }).click();
+    const physics = startProgram(name, options);
+    // The command starts physics, which receives forces.
+    await page.locator("#panel .hint", { hasText: "holds a mode by a constant force" }).waitFor();
+    await end(physics);
+    await close(shown);
 });
 
 /** Its vibrations of 206 Hz are slowed down by default, so that they are seen. */
@@ -319,16 +444,22 @@ test("an animated mode of a stiff body is slowed down, and the page says by whic
 });
 
 for (const [name, content, reason] of [
-    ["beam.npz", new Beam().npz(null), "got 2 modes without: add the array eigenvalues"],
-    ["beam.stl", new Beam().stl(), "got no modes: add the arrays U and eigenvalues"],
+    ["beam.npz", new Beam().npz(null), "The modes of this model have no stiffness"],
+    ["beam.stl", new Beam().stl(), "This model is rigid"],
 ] as const) {
     test(`${name} without eigenvalues says why it does not answer a pull`, { timeout: LIMIT_MS }, async () => {
         const shown = await view(name, content);
         const { page, program } = shown;
-        const notice = page.locator(".notice", { hasText: "Nothing answers a pull." });
+        const notice = page.locator(".notice", { hasText: reason });
         await notice.waitFor();
         const text = (await notice.textContent()) ?? "";
-        assert.ok(text.includes(reason), text);
+        assert.ok(text.includes(`modalcast view ${name} --modes 20`), text);
+        assert.ok(
+            (await page.locator("#panel .hint", { hasText: reason }).count()) > 0,
+            "expected it in the panel, too",
+        );
+        const reset = page.getByRole("button", { name: "Set all to 0" });
+        assert.equal(await reset.isVisible(), name === "beam.npz", "a model without modes has no sliders");
         await takeScreenshot(page, `view-${name.replace("beam.", "")}-without-eigenvalues`);
         assert.deepEqual(children(program), {}, "expected no child process, and no zombie");
         // A pull shows the reason again after the user has closed it.
