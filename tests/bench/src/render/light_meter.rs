@@ -9,12 +9,13 @@ use modalcast_model::domain::{Material, Texture};
 use modalcast_model::error::Result;
 use modalcast_model::scene::{Ground, RenderSettings, Scene, SceneParts};
 
-/// The scene with these render settings. No quality preset replaces any of them.
+/// The scene with these render settings. The rule without a preset replaces none of them; a named preset remains.
 ///
 /// # Errors
 /// `Invalid` when the settings contradict each other.
 pub(super) fn with_settings(scene: &Scene, look: RenderSettings) -> Result<Arc<Scene>> {
-    Scene::new(SceneParts { look: RenderSettings { preset: None, ..look }, ..scene.parts() })
+    let preset = look.preset.filter(|request| request.preset.is_some());
+    Scene::new(SceneParts { look: RenderSettings { preset, ..look }, ..scene.parts() })
 }
 
 /// The scene with white, matte surfaces. The alpha of blended surfaces and cut-outs remains. The sunlight is 1, the

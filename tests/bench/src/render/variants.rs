@@ -7,7 +7,8 @@ use serde::Serialize;
 use super::packing::Packing;
 use super::workloads::RenderWorkload;
 use modalcast_model::scene::{
-    Antialiasing, Culling, MomentFormat, RenderSettings, ShadowFit, ShadowMethod, ShadowSettings, Transparency,
+    Antialiasing, Culling, LookOverrides, LookPreset, MomentFormat, PresetRequest, RenderSettings, ShadowFit,
+    ShadowMethod, ShadowSettings, Transparency,
 };
 use modalcast_render::BlurMethod;
 
@@ -23,6 +24,17 @@ pub enum ShadowVariant {
     Filtered,
     /// Variance shadow map.
     Variance,
+}
+
+/// Sampling of the ambient occlusion.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OcclusionVariant {
+    /// One texel per pixel, as GPUs sample it, and all renderers for pictures.
+    FullResolution,
+    /// One texel for 2 x 2 pixels, as a CPU samples it for streams.
+    HalfResolution,
+    /// No ambient occlusion.
+    None,
 }
 
 /// Intended result of a variant: the reference that it is compared with.
@@ -51,8 +63,8 @@ pub struct RenderVariant {
     pub culling: Option<Culling>,
     /// Antialiasing, for variants that compare it.
     pub antialias: Option<Antialiasing>,
-    /// Whether the scene's ambient occlusion is drawn, for variants that compare it.
-    pub has_occlusion: Option<bool>,
+    /// Sampling of the scene's ambient occlusion, for variants that compare it.
+    pub occlusion: Option<OcclusionVariant>,
     /// Implementation of the shadow blur. It changes the image only by rounding.
     pub blur_method: BlurMethod,
     pub intended_reference: ReferenceKind,
@@ -71,8 +83,10 @@ impl RenderVariant {
     pub fn settings(&self, look: RenderSettings) -> RenderSettings {
         let (transparency, culling) =
             (self.transparency.unwrap_or(look.transparency), self.culling.unwrap_or(look.culling));
-        let ambient_occlusion = look.ambient_occlusion.filter(|_| self.has_occlusion != Some(false));
-        let settings = RenderSettings { shadow: self.shadow, transparency, culling, ambient_occlusion, ..look };
+        let ambient_occlusion = look.ambient_occlusion.filter(|_| self.occlusion != Some(OcclusionVariant::None));
+        let is_half = self.occlusion == Some(OcclusionVariant::HalfResolution);
+        let preset = if is_half { Some(half_resolution_request(&look)) } else { look.preset };
+        let settings = RenderSettings { shadow: self.shadow, transparency, culling, ambient_occlusion, preset, ..look };
         match self.antialias {
             Some(antialias) => RenderSettings { antialias, samples: MULTISAMPLES, ..settings },
             None => settings,
@@ -83,7 +97,7 @@ impl RenderVariant {
     pub fn is_applicable(&self, workload: RenderWorkload) -> bool {
         let is_large = matches!(workload, RenderWorkload::Tree | RenderWorkload::Grove | RenderWorkload::Triangles(_));
         let matches_packing = self.packing.is_some() == (workload == RenderWorkload::Images);
-        let matches_occlusion = self.has_occlusion.is_some() == (workload == RenderWorkload::Bracket);
+        let matches_occlusion = self.occlusion.is_some() == (workload == RenderWorkload::Bracket);
         matches_packing
             && matches_occlusion
             && (self.transparency.is_none() || workload == RenderWorkload::Panes)
@@ -97,7 +111,7 @@ impl RenderVariant {
         let has_moments_only = |shadow: ShadowSettings| shadow.has_moments() && !shadow.pcf_fallback;
         match workload {
             RenderWorkload::Layers => self.shadow.is_some_and(has_moments_only),
-            RenderWorkload::Bracket => self.has_occlusion == Some(false),
+            RenderWorkload::Bracket => self.occlusion == Some(OcclusionVariant::None),
             _ => false,
         }
     }
@@ -111,7 +125,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
-            has_occlusion: None,
+            occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Unshadowed,
         }
@@ -128,7 +142,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
-            has_occlusion: None,
+            occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -190,7 +204,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
-            has_occlusion: None,
+            occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference: ReferenceKind::Hard,
         }
@@ -207,8 +221,8 @@ impl RenderVariant {
     }
 
     /// With or without the scene's ambient occlusion, without shadows.
-    fn with_occlusion((name, has_occlusion): (&str, bool)) -> Self {
-        Self { name: name.into(), has_occlusion: Some(has_occlusion), ..Self::without_shadow() }
+    fn with_occlusion((name, occlusion): (&str, OcclusionVariant)) -> Self {
+        Self { name: name.into(), occlusion: Some(occlusion), ..Self::without_shadow() }
     }
 
     /// One antialiasing method, without shadows. The reference has 64 samples per pixel, 16 in a quick run.
@@ -236,7 +250,7 @@ impl RenderVariant {
             packing: None,
             culling: None,
             antialias: None,
-            has_occlusion: None,
+            occlusion: None,
             blur_method: BlurMethod::Auto,
             intended_reference,
         }
@@ -284,8 +298,20 @@ fn packing_variants() -> [RenderVariant; 3] {
     ]
 }
 
-fn occlusion_variants() -> [RenderVariant; 2] {
-    [("occlusion", true), ("no occlusion", false)].map(RenderVariant::with_occlusion)
+fn occlusion_variants() -> [RenderVariant; 3] {
+    [
+        ("occlusion", OcclusionVariant::FullResolution),
+        ("occlusion, half resolution", OcclusionVariant::HalfResolution),
+        ("no occlusion", OcclusionVariant::None),
+    ]
+    .map(RenderVariant::with_occlusion)
+}
+
+/// The preset that samples the ambient occlusion at half resolution, with the antialiasing of the look.
+fn half_resolution_request(look: &RenderSettings) -> PresetRequest {
+    let overrides =
+        LookOverrides { antialias: Some(look.antialias), samples: Some(look.samples), ..LookOverrides::default() };
+    PresetRequest { preset: Some(LookPreset::Preview), overrides }
 }
 
 fn culling_variants() -> [RenderVariant; 3] {
@@ -329,10 +355,10 @@ mod tests {
             let variants = all(quick);
             let names: std::collections::BTreeSet<&str> =
                 variants.iter().map(|variant| variant.name.as_str()).collect();
-            // Quick: 16 variants, 3 of packing, 3 of culling and 2 of occlusion. All: 1 without shadow, 5 map sizes x
+            // Quick: 16 variants, 3 of packing, 3 of culling and 3 of occlusion. All: 1 without shadow, 5 map sizes x
             // 6, 2 f16, 1 without the fallback, 2 bleeding, 3 cascades, 1 corner fit, 3 maps x 3 blur methods, 2
-            // transparency, 3 of packing, 3 of culling, 3 of antialiasing and 2 of occlusion.
-            assert_eq!((names.len(), variants.len()), if quick { (24, 24) } else { (62, 62) });
+            // transparency, 3 of packing, 3 of culling, 3 of antialiasing and 3 of occlusion.
+            assert_eq!((names.len(), variants.len()), if quick { (25, 25) } else { (63, 63) });
             for variant in &variants {
                 let settings = variant.settings(RenderSettings::default());
                 let transparency = variant.transparency.unwrap_or_default();
@@ -340,12 +366,14 @@ mod tests {
                 let antialias = variant.antialias.unwrap_or_default();
                 let expected =
                     RenderSettings { shadow: None, transparency, culling, antialias, ..RenderSettings::default() };
-                assert_eq!(RenderSettings { shadow: None, ..settings }, expected);
+                assert_eq!(RenderSettings { shadow: None, preset: None, ..settings }, expected);
+                let is_half = variant.occlusion == Some(OcclusionVariant::HalfResolution);
+                assert_eq!(settings.preset.is_some(), is_half, "{}", variant.name);
                 let (has_transparency, has_packing) = (variant.transparency.is_some(), variant.packing.is_some());
                 let applies_to = [RenderWorkload::Panes, RenderWorkload::Tree, RenderWorkload::Images]
                     .map(|workload| variant.is_applicable(workload));
                 let needs_large_scene = variant.culling.is_some() || variant.antialias.is_some();
-                let has_plain_shading = !has_packing && variant.has_occlusion.is_none();
+                let has_plain_shading = !has_packing && variant.occlusion.is_none();
                 assert_eq!(
                     applies_to,
                     [has_plain_shading && !needs_large_scene, has_plain_shading && !has_transparency, has_packing],
@@ -363,9 +391,10 @@ mod tests {
         for quick in [false, true] {
             let mut variants = all(quick);
             variants.retain(|variant| variant.is_applicable(RenderWorkload::Bracket));
-            let [with_occlusion, without_occlusion] = &variants[..] else { panic!("expected two, got {variants:?}") };
+            let [full, half, without_occlusion] = &variants[..] else { panic!("expected three, got {variants:?}") };
             let expected = RenderSettings { shadow: None, ..look };
-            assert_eq!(with_occlusion.settings(look), expected);
+            assert_eq!(full.settings(look), expected);
+            assert_eq!(RenderSettings { preset: None, ..half.settings(look) }, expected);
             assert_eq!(without_occlusion.settings(look), RenderSettings { ambient_occlusion: None, ..expected });
             assert!(expected.ambient_occlusion.is_some(), "control: the studio has ambient occlusion");
         }
