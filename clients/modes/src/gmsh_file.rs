@@ -75,7 +75,7 @@ fn read_format(cursor: &mut FileCursor<'_>) -> Result<(bool, Encoding)> {
     }
 }
 
-/// What was read so far.
+/// The sections of the file that have been read.
 #[derive(Debug, Default)]
 struct GmshFile {
     cells: CellCollector,

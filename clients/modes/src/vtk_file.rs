@@ -168,7 +168,7 @@ impl VtkFile<'_> {
     fn read_attribute(&mut self, components: usize) -> Result<()> {
         let name = self.cursor.word().unwrap_or_default();
         let number_type = type_of(self.cursor.word())?;
-        // What is left of the line.
+        // The rest of the line.
         let mut ahead = self.cursor.clone();
         let line = String::from_utf8_lossy(ahead.line().unwrap_or_default()).into_owned();
         let components = match line.trim().parse() {

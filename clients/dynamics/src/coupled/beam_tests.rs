@@ -193,7 +193,7 @@ fn divided_cantilever_has_the_frequencies_of_the_whole() {
             assert!(errors[..5].iter().all(|error| error.abs() <= 5e-3), "width {width}, {count}: {errors:?}");
             assert!(tip_error.abs() <= 2e-3, "width {width}, {count} domains: {tip_error}");
         }
-        // Control: without the inertia of what it carries, a domain has the modes of a clamped-free beam.
+        // Control: without the inertia of its descendants, a domain has the modes of a clamped-free beam.
         let mut free = create_model(&chain(5, 1.0, radius), 6);
         for domain in &mut free.domains {
             let part = BeamPart { length: 0.2, ..chain(1, 1.0, radius)[0] };

@@ -27,7 +27,7 @@ pub(super) struct OrganBeam {
     pub(super) rings: Vec<RingCenter>,
 }
 
-/// What is known of a leaf, in the frame of its domain.
+/// The geometry of a leaf, in the frame of its domain.
 #[derive(Debug)]
 pub(super) struct LeafGeometry {
     /// Polyline of the petiole; empty without one.
