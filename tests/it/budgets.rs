@@ -219,10 +219,11 @@ async fn connection_above_its_share_is_closed_when_others_wait() {
 
 /// Three unread calls, each with 4.3 MB of modes, exhaust the budget of their connection. Each can hold up to 4 MiB:
 /// two messages of 1 MiB in its queue and two in HTTP/2. When a fourth call waits, unread calls end with a reason, and
-/// the fourth call gets the bytes of their queues.
+/// the fourth call gets the bytes of their queues. It reserves 3 MiB for its first part, the limit of a message, and
+/// HTTP/2 keeps 6 MiB of the unread calls.
 #[tokio::test(flavor = "multi_thread")]
 async fn unread_calls_end_with_a_reason_when_others_wait() {
-    let limits = |config| Config { connection_reply_bytes: 8 << 20, reply_timeout: SILENCE_LIMIT, ..config };
+    let limits = |config| Config { connection_reply_bytes: 10 << 20, reply_timeout: SILENCE_LIMIT, ..config };
     let server = Server::start_with(limits).await;
     server.open("sheet").await;
     let channel = small_windows(&server.address).await;
