@@ -18,7 +18,7 @@ RECORD = PROJECT / "tests/bench/records/fuzz.json"
 
 # The targets of each fuzzer.
 FUZZERS = {
-    "files": "glb gltf image manifest mtl npy npz obj plant ply safetensors sofa stl vega vega_config",
+    "files": "glb gltf image manifest mtl npy npz obj plant ply safetensors skeleton sofa stl vega vega_config",
     "recordings": "recording",
     "cubic_forces": "cub",
     "steps": "step",

@@ -30,8 +30,8 @@ const MAX_NOTE_CHARS: usize = 100;
   modalcast inspect part.stl --unit mm
   modalcast inspect path/to/model.glb --json")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
-    /// one model.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl, .npz or
+    /// .structure.json file, or a folder with one model.
     scene: String,
     #[command(flatten)]
     loading: LoadingOptions,

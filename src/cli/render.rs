@@ -23,8 +23,8 @@ use modalcast_model::scene::{Camera, FrameSize, FrameStyle, Lens, LookPreset, Me
   modalcast render model.glb --out side.png --eye 4,1,0 --target 0,1,0 --look best
   modalcast render tree --q bent.npy --output displacement --largest 0.5 --out moved.png")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, or a folder with
-    /// one model.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl, .npz or
+    /// .structure.json file, or a folder with one model.
     scene: String,
     #[command(flatten)]
     loading: LoadingOptions,

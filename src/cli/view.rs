@@ -36,8 +36,9 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view tree.mcap                          plays a recording
   modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
 pub(super) struct Args {
-    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl or .npz file, a folder with one
-    /// model, a volume mesh (.msh, .vtk, .vtu or .veg), whose modes are computed, or a recording: an .mcap file, which the browser plays.
+    /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl, .npz or
+    /// .structure.json file, a folder with one model, a volume mesh (.msh, .vtk, .vtu or .veg), whose modes are
+    /// computed, or a recording: an .mcap file, which the browser plays.
     model: String,
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
     #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]

@@ -52,6 +52,14 @@ pub(crate) fn seeds(target: &str) -> Vec<Vec<u8>> {
             .collect()
         }
         "safetensors" => vec![safetensors()],
+        "skeleton" => texts(&[
+            "{\"shoots\":[{\"id\":0,\"parent\":-1,\"vertices\":[[0,0,0],[0.1,0,0.5],[0,0,1]],\"radii\":[0.02,0.01,0.01]},\
+             {\"id\":1,\"parent\":0,\"vertices\":[[0,0,1],[0.2,0,1]],\"radii\":[0.003,0.002],\"modes\":4}],\
+             \"leaves\":[{\"object_id\":2,\"shoot\":1,\"node\":0,\"petiole\":0,\"base\":[0.2,0.05,1],\
+             \"petiole_vertices\":[[0.2,0,1],[0.2,0.05,1]],\"tip\":[0.2,0.1,1],\"width\":0.03,\"modes\":0},\
+             {\"object_id\":3,\"shoot\":1,\"node\":0,\"petiole\":0,\"base\":[0.2,0.05,1]}]}",
+            "{\"shoots\":[{\"id\":0,\"parent\":-1,\"vertices\":[[0,0,0],[0,0,1]],\"radii\":[0.01,0]}],\"leaves\":[]}",
+        ]),
         "sofa" => texts(&["12 1\n0\n0\n1\n0\n0\n1\n0\n0\n1\n0\n0\n1\n", "12. 0.\n"]),
         "stl" => [
             texts(&[

@@ -15,7 +15,7 @@ use temporary_folder::temporary_folder;
 const MAX_MEMORY: u64 = 256 << 20;
 
 /// The names of all targets.
-pub(crate) const TARGETS: [&str; 15] = [
+pub(crate) const TARGETS: [&str; 16] = [
     "glb",
     "gltf",
     "image",
@@ -27,6 +27,7 @@ pub(crate) const TARGETS: [&str; 15] = [
     "plant",
     "ply",
     "safetensors",
+    "skeleton",
     "sofa",
     "stl",
     "vega",
@@ -82,6 +83,7 @@ impl FileTarget {
             "plant" => ("m.obj", Input::Plant, square),
             "ply" => ("m.ply", Input::File("m.ply"), &[][..]),
             "safetensors" => ("m.obj", Input::File("m.safetensors"), square),
+            "skeleton" => ("m.structure.json", Input::File("m.structure.json"), &[][..]),
             "sofa" => ("m.obj", Input::File("modes.txt"), square),
             "stl" => ("m.stl", Input::File("m.stl"), &[][..]),
             "vega" => ("m.obj", Input::File("m.URendering.float"), square),

@@ -1,12 +1,13 @@
 //! Loaders: from files to scenes.
 //!
 //! # Scene names
-//! A scene is a built-in name (`tree`), a folder with `scene.toml`, a `.glb`, `.gltf`, `.obj`, `.ply`, `.stl` or `.npz`
-//! file, or a folder with one such file. A folder with several is rejected with an error that lists them.
+//! A scene is a built-in name (`tree`), a folder with `scene.toml`, a `.glb`, `.gltf`, `.obj`, `.ply`, `.stl`, `.npz`
+//! or `.structure.json` file, or a folder with one such file. A folder with several is rejected with an error that
+//! lists them.
 //!
 //! `manifest/README.md` is the reference: keys of `scene.toml`, models, and the names of mode files beside a model. An
 //! OBJ file is loaded as a plant if its folder also contains the two files with the structure of the plant (module
-//! `plant`).
+//! `plant`). The structure alone is a plant with generated meshes.
 //!
 //! # Conventions
 //! - Rows of U follow the `v` lines of an OBJ file, including unreferenced and coincident vertices.

@@ -281,7 +281,7 @@ mod tests {
         let ambiguous = repository.open("two", &MemoryReservation::unlimited()).expect_err("two models").to_string();
         assert_eq!(
             ambiguous,
-            "folder 'two': expected scene.toml or one .glb, .gltf, .obj, .ply, .stl or .npz file, got 2: b.obj, c.obj"
+            "folder 'two': expected scene.toml or one .glb, .gltf, .obj, .ply, .stl, .npz or .structure.json file, got 2: b.obj, c.obj"
         );
         let empty =
             repository.open("none", &MemoryReservation::unlimited()).expect_err("a folder without models").to_string();

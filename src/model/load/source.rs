@@ -27,6 +27,8 @@ pub(super) enum ModelFile {
     Stl(String),
     /// A NumPy archive with the arrays `vertices` and `faces`.
     Npz(String),
+    /// `STEM.structure.json`: the structure of a plant without an OBJ file.
+    Skeleton(String),
 }
 
 impl ModelFile {
@@ -38,7 +40,8 @@ impl ModelFile {
             | Self::Plant(name)
             | Self::Ply(name)
             | Self::Stl(name)
-            | Self::Npz(name) => name,
+            | Self::Npz(name)
+            | Self::Skeleton(name) => name,
         }
     }
 
@@ -50,12 +53,13 @@ impl ModelFile {
             Self::Ply(_) => 1,
             Self::Stl(_) => 2,
             Self::Npz(_) => 3,
+            Self::Skeleton(_) => 4,
         }
     }
 }
 
 /// The formats in error messages.
-const FORMATS: &str = ".glb, .gltf, .obj, .ply, .stl or .npz";
+const FORMATS: &str = ".glb, .gltf, .obj, .ply, .stl, .npz or .structure.json";
 
 /// The largest number of names in an error message.
 const MAX_LISTED_NAMES: usize = 16;
@@ -136,6 +140,7 @@ fn read_model_file(folder: &AssetDir, model: &ModelFile, options: ModelOptions) 
         ModelFile::Ply(name) => ply::read(folder, name, options),
         ModelFile::Stl(name) => stl::read(folder, name, options),
         ModelFile::Npz(name) => npz_model::read(folder, name, options),
+        ModelFile::Skeleton(name) => plant::read_skeleton(folder, name, options),
     }?;
     let is_rigid = parts.shapes.iter().all(|shape| shape.modes.rank() == 0);
     if is_rigid && options.modes == ModesSource::Sidecar {
@@ -152,17 +157,33 @@ pub(super) fn recognize_model(name: &str) -> Option<ModelFile> {
         "ply" => Some(ModelFile::Ply(name.into())),
         "stl" => Some(ModelFile::Stl(name.into())),
         "npz" => Some(ModelFile::Npz(name.into())),
+        "json" if is_structure(name) => Some(ModelFile::Skeleton(name.into())),
         _ => None,
     }
 }
 
-/// As [`recognize_model`], but only for a NumPy archive that contains a mesh: most archives contain other arrays.
+/// Whether a file name is `STEM.structure.json`, in any letter case.
+fn is_structure(name: &str) -> bool {
+    let start = name.len().checked_sub(plant::STRUCTURE_SUFFIX.len());
+    let suffix = start.filter(|start| *start > 0).and_then(|start| name.get(start..));
+    suffix.is_some_and(|suffix| suffix.eq_ignore_ascii_case(plant::STRUCTURE_SUFFIX))
+}
+
+/// As [`recognize_model`], but only for a NumPy archive that contains a mesh, because most archives contain other
+/// arrays, and only for a structure without an OBJ file beside it.
 pub(super) fn find_model(folder: &AssetDir, name: &str) -> Option<ModelFile> {
-    recognize_model(name).filter(|model| !matches!(model, ModelFile::Npz(_)) || npz_model::is_model(folder, name))
+    recognize_model(name).filter(|model| match model {
+        ModelFile::Npz(_) => npz_model::is_model(folder, name),
+        ModelFile::Skeleton(_) => {
+            let stem = &name[..name.len() - plant::STRUCTURE_SUFFIX.len()];
+            !folder.has_file(&format!("{stem}.obj"))
+        }
+        _ => true,
+    })
 }
 
 /// The models of a folder: its glTF and OBJ files; if there is none, its PLY files, else its STL files, else its NumPy
-/// archives with a mesh.
+/// archives with a mesh, else its structures of plants.
 pub(super) fn find_models(folder: &AssetDir) -> Vec<ModelFile> {
     let mut models: Vec<ModelFile> = folder.listing().file_names().filter_map(recognize_model).collect();
     let rank = models.iter().map(ModelFile::format_rank).min();

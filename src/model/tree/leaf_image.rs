@@ -12,16 +12,19 @@ const SIDE: usize = 256;
 
 /// The range of u that the leaf covers. It has a margin on the left, because filtering with wrap mode "repeat" blends
 /// the strip at the right edge into the left edge.
-pub(super) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
+pub(crate) const LEAF_SPAN: [f32; 2] = [0.03, 0.90];
 
 /// The texture coordinate u at the center of the strip for stems.
-pub(super) const STEM_U: f32 = 0.965;
+pub(crate) const STEM_U: f32 = 0.965;
 
 /// The texture coordinate u at the left edge of the strip for stems.
 const STRIP_LEFT: f32 = 0.93;
 
 /// Length of the petiole at the bottom of the image, as a fraction of the height.
 const PETIOLE_LENGTH: f32 = 0.13;
+
+/// The texture coordinate v where the petiole ends and the blade begins. The tip of the blade is near 0.
+pub(crate) const LEAF_BLADE_START: f32 = 1.0 - PETIOLE_LENGTH;
 
 /// Height of the tip of the blade, as a fraction of the height of the image.
 const TIP_HEIGHT: f32 = 0.985;

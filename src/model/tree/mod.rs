@@ -23,6 +23,7 @@ mod skin;
 mod species;
 mod template;
 
+pub(crate) use leaf_image::{LEAF_BLADE_START, LEAF_SPAN, STEM_U};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
@@ -43,6 +44,9 @@ impl Default for TreeParameters {
         Self { seed: 7 }
     }
 }
+
+/// The names of the materials that [`add_materials`] adds.
+pub(crate) const TREE_MATERIALS: [&str; 3] = ["bark", LEAF_MATERIALS[0].0, LEAF_MATERIALS[1].0];
 
 /// Index of the bark material. The leaf materials follow it.
 const BARK_MATERIAL: usize = 0;
@@ -84,7 +88,7 @@ pub fn generate(parameters: &TreeParameters) -> Result<SceneParts> {
         skylight: [0.30, 0.34, 0.39],
         ..RenderSettings::default()
     };
-    add_materials(&mut parts, &mut random.fork())?;
+    add_seeded_materials(&mut parts, &mut random.fork())?;
     let templates = species::grow_templates(&mut random.fork())?;
     let shapes_and_metadata = templates.par_iter().map(PartTemplate::build_shape).collect::<Result<Vec<_>>>()?;
     let (shapes, metadata): (Vec<_>, Vec<_>) = shapes_and_metadata.into_iter().unzip();
@@ -95,7 +99,15 @@ pub fn generate(parameters: &TreeParameters) -> Result<SceneParts> {
     Ok(parts)
 }
 
-fn add_materials(parts: &mut SceneParts, random: &mut SplitMix64) -> Result<()> {
+/// Adds bark, leaves and sunlit leaves with their images to a scene without materials.
+///
+/// # Errors
+/// None in practice, because the sizes of the images are constants.
+pub(crate) fn add_materials(parts: &mut SceneParts) -> Result<()> {
+    add_seeded_materials(parts, &mut SplitMix64::new(TreeParameters::default().seed).fork())
+}
+
+fn add_seeded_materials(parts: &mut SceneParts, random: &mut SplitMix64) -> Result<()> {
     parts.textures.extend(bark::textures(random)?);
     parts.materials.push(Material {
         name: "bark".into(),

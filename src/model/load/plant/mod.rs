@@ -6,6 +6,8 @@
 //! loaded-interface modes (crate `modalcast-beam`). The rest shape is the equilibrium under the weight, so gravity is no
 //! load. Other objects, such as fruits, move rigidly with the nearest section of their shoot. Shoots without radii are
 //! rigid. If no shoot has radii, all organs are rigid.
+//!
+//! A structure without an OBJ file is a plant, too: its meshes are generated ([`skeleton`]).
 
 mod blade;
 #[cfg(test)]
@@ -13,6 +15,9 @@ mod flexible_tests;
 mod organ_beams;
 mod organ_modes;
 mod organs;
+mod skeleton;
+#[cfg(test)]
+mod skeleton_tests;
 mod skin;
 mod structure;
 
@@ -31,12 +36,24 @@ use super::plant_materials::PlantMaterials;
 use super::polygons::{self, PolygonMesh};
 use super::surface::{ModelOptions, ModesSource};
 use crate::domain::{Attachment, CreaseAngle, Domain, Metadata, Modes, Shape, Transform};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::scene::{SceneParts, UpAxis};
 
 /// Most points of the polyline of a flexible organ. The time for an organ goes as its points times the vertices of its
 /// mesh.
 const MAX_BEAM_POINTS: usize = 4096;
+
+/// The end of the name of a file with the structure of a plant.
+pub(super) const STRUCTURE_SUFFIX: &str = ".structure.json";
+
+/// The meshes of all organs of a plant.
+#[derive(Debug, Default)]
+struct PlantMeshes {
+    polygons: PolygonMesh,
+    /// The object of each face.
+    object_ids: Vec<u64>,
+    faces_by_organ: HashMap<Organ, Vec<usize>>,
+}
 
 /// Reads the plant whose OBJ file is `name` in the folder `files`.
 ///
@@ -47,8 +64,7 @@ const MAX_BEAM_POINTS: usize = 4096;
 /// `Invalid` with the file, and the expected and given value.
 pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
     let stem = stem_of(name);
-    let (structure_file, ids_file) = (format!("{stem}.structure.json"), format!("{stem}_object_id.dat"));
-    let file_field = |name: &str| format!("file '{name}'");
+    let (structure_file, ids_file) = (format!("{stem}{STRUCTURE_SUFFIX}"), format!("{stem}_object_id.dat"));
     let obj = obj::parse_file(files, name)?;
     files.reserve(&format!("mesh of '{name}'"), obj.polygons.build_bytes())?;
     let structure = PlantStructure::parse(&files.read(&structure_file, MAX_TEXT_BYTES)?)
@@ -57,7 +73,7 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     let object_ids = object_ids.map_err(|error| error.prefix_field(&file_field(&ids_file)))?;
     let organs = assign_organs(&structure, &positions_by_object(&obj.polygons, &object_ids))
         .map_err(|error| error.prefix_field(&file_field(&structure_file)))?;
-    let mut parts = SceneParts { up: UpAxis::Z, unit: Some(1.0), ..SceneParts::named(stem) };
+    let mut parts = named_parts(stem);
     obj::add_materials(&obj, files, &mut parts)?;
     let mut faces_by_organ: HashMap<Organ, Vec<usize>> = HashMap::new();
     for (face, object_id) in object_ids.iter().enumerate() {
@@ -66,11 +82,49 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
             faces_by_organ.entry(*organ).or_default().push(face);
         }
     }
+    build(PlantMeshes { polygons: obj.polygons, object_ids, faces_by_organ }, &structure, files, options, parts)
+}
+
+/// Reads the plant whose structure is the file `name` in the folder `files`, without an OBJ file. Frames are those of
+/// [`read`].
+///
+/// # Errors
+/// As for [`read`].
+pub(super) fn read_skeleton(files: &AssetDir, name: &str, options: ModelOptions) -> Result<SceneParts> {
+    let text = files.read(name, MAX_TEXT_BYTES)?;
+    let in_file = |error: Error| error.prefix_field(&file_field(name));
+    let mut structure = PlantStructure::parse_without_meshes(&text).map_err(in_file)?;
+    let memory = files.reserve_polygons(name, text.len())?;
+    drop(text);
+    let meshes = skeleton::build_meshes(&mut structure, memory)?;
+    files.reserve(&format!("mesh of '{name}'"), meshes.polygons.build_bytes())?;
+    let mut parts = named_parts(&name[..name.len() - STRUCTURE_SUFFIX.len()]);
+    crate::tree::add_materials(&mut parts)?;
+    build(meshes, &structure, files, options, parts).map_err(in_file)
+}
+
+fn file_field(name: &str) -> String {
+    format!("file '{name}'")
+}
+
+fn named_parts(name: &str) -> SceneParts {
+    SceneParts { up: UpAxis::Z, unit: Some(1.0), ..SceneParts::named(name) }
+}
+
+/// Builds the domains, and adds their modes if any shoot has radii.
+fn build(
+    meshes: PlantMeshes,
+    structure: &PlantStructure,
+    files: &AssetDir,
+    options: ModelOptions,
+    parts: SceneParts,
+) -> Result<SceneParts> {
+    let PlantMeshes { polygons, object_ids, faces_by_organ } = meshes;
     let builder = PlantBuilder {
-        polygons: &obj.polygons,
-        structure: &structure,
+        polygons: &polygons,
+        structure,
         object_ids: &object_ids,
-        object_of_vertex: objects_of_vertices(&obj.polygons, &object_ids),
+        object_of_vertex: objects_of_vertices(&polygons, &object_ids),
         faces_by_organ,
         organ_domains: HashMap::new(),
         bodies: Vec::new(),
@@ -167,7 +221,10 @@ impl PlantBuilder<'_> {
             .map_err(|error| error.prefix_field(&name))?;
         self.parts.remarks.extend(triangle_mesh.remark().map(|remark| format!("{name}: {remark}")));
         let parent = parent.and_then(|parent| self.organ_domains.get(&parent)).copied();
-        let kind = if matches!(organ, Organ::Shoot(_)) { OrganKind::Shoot } else { OrganKind::Leaf };
+        let (kind, mode_count) = match organ {
+            Organ::Shoot(index) => (OrganKind::Shoot, self.structure.shoots[index].modes),
+            Organ::Leaf(index) => (OrganKind::Leaf, self.structure.leaves[index].modes),
+        };
         let mesh = OrganMesh {
             faces: &faces,
             origin: origin.into(),
@@ -177,6 +234,7 @@ impl PlantBuilder<'_> {
         self.bodies.push(OrganBody {
             kind,
             parent: parent.map(|(index, _)| index),
+            mode_count,
             origin: origin.into(),
             flexible: self.create_flexible_body(organ, &mesh),
         });

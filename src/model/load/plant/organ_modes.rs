@@ -56,6 +56,8 @@ pub(super) struct OrganBody {
     pub(super) kind: OrganKind,
     /// Index of the parent.
     pub(super) parent: Option<usize>,
+    /// Number of modes by the file; `None` for the default.
+    pub(super) mode_count: Option<usize>,
     /// Origin of the frame in the scene, meters. All frames have the axes of the scene.
     pub(super) origin: Vector3<f64>,
     /// The beam, or why the organ is rigid.
@@ -153,7 +155,9 @@ fn find_copies(bodies: &mut [OrganBody], child_counts: &[usize]) -> Vec<Option<(
             continue;
         }
         let Ok(flexible) = &bodies[index].flexible else { continue };
-        let similar = originals.iter().find_map(|original| {
+        let mode_count = bodies[index].mode_count;
+        let comparable = originals.iter().filter(|original| bodies[**original].mode_count == mode_count);
+        let similar = comparable.into_iter().find_map(|original| {
             let other = bodies[*original].flexible.as_ref().ok()?;
             let similarity = other.beam.similarity_to(&flexible.beam, COPY_TOLERANCE)?;
             Some((*original, similarity, other.beam.transformed(&similarity, &flexible.beam.nodes()[0])))
@@ -192,6 +196,9 @@ fn carry_children(bodies: &mut [OrganBody], joints: &[Option<Joint>]) {
 /// The number of modes of an organ.
 fn wanted_rank(body: &OrganBody, child_count: usize) -> usize {
     let Ok(FlexibleBody { beam, .. }) = &body.flexible else { return 0 };
+    if let Some(count) = body.mode_count {
+        return count;
+    }
     match body.kind {
         OrganKind::Leaf if child_count == 0 => LEAF_MODES,
         OrganKind::Leaf => STUB_MODES,

@@ -103,17 +103,24 @@ fn nearest_shoot(structure: &PlantStructure, points: &[[f64; 3]]) -> Option<Orga
 
 /// Squared distance of a point to a polyline.
 fn squared_distance_to_polyline(polyline: &[[f64; 3]], point: &Vector3<f64>) -> f64 {
-    let squared_distance_to_segment = |end_points: &[[f64; 3]]| {
+    (nearest_point_on_polyline(polyline, point) - point).norm_squared()
+}
+
+/// The point of a polyline that is nearest to a point. The polyline has at least one point.
+pub(super) fn nearest_point_on_polyline(polyline: &[[f64; 3]], point: &Vector3<f64>) -> Vector3<f64> {
+    let nearest_on_segment = |end_points: &[[f64; 3]]| {
         let start = Vector3::from(end_points[0]);
         let direction = Vector3::from(end_points[end_points.len() - 1]) - start;
         let squared_length = direction.norm_squared();
         let fraction =
             if squared_length > 0.0 { ((point - start).dot(&direction) / squared_length).clamp(0.0, 1.0) } else { 0.0 };
-        (start + direction * fraction - point).norm_squared()
+        start + direction * fraction
     };
     // A polyline of one point is a segment of length 0.
     let points_per_segment = 2.min(polyline.len());
-    polyline.windows(points_per_segment).map(squared_distance_to_segment).fold(f64::INFINITY, f64::min)
+    let squared_distance = |nearest: &Vector3<f64>| (nearest - point).norm_squared();
+    let nearest = polyline.windows(points_per_segment).map(nearest_on_segment);
+    nearest.min_by(|a, b| squared_distance(a).total_cmp(&squared_distance(b))).unwrap_or_default()
 }
 
 #[cfg(test)]

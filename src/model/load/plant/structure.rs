@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 
+use crate::domain::MAX_RANK;
 use crate::error::{Result, invalid};
 
 /// A shoot: a polyline from its base, in scene units, and its parent shoot.
@@ -14,6 +15,9 @@ pub(super) struct Shoot {
     /// One radius per vertex, in scene units; `None` if the file has none.
     #[serde(default)]
     pub(super) radii: Option<Vec<f64>>,
+    /// Number of modes; `None` for the default.
+    #[serde(default)]
+    pub(super) modes: Option<usize>,
 }
 
 /// A leaf or leaflet. Leaflets of one petiole have the same `shoot`, `node` and `petiole`. One of them has the polyline
@@ -31,11 +35,20 @@ pub(super) struct Leaf {
     pub(super) base: [f64; 3],
     #[serde(default)]
     pub(super) petiole_vertices: Option<Vec<[f64; 3]>>,
+    /// Where the blade ends, in scene units. Only for plants without an OBJ file.
+    #[serde(default)]
+    pub(super) tip: Option<[f64; 3]>,
+    /// Width of the blade, in scene units. Only for plants without an OBJ file.
+    #[serde(default)]
+    pub(super) width: Option<f64>,
+    /// Number of modes; `None` for the default.
+    #[serde(default)]
+    pub(super) modes: Option<usize>,
 }
 
 #[derive(serde::Deserialize)]
 struct StructureJson {
-    objects: BTreeMap<String, String>,
+    objects: Option<BTreeMap<String, String>>,
     shoots: Vec<Shoot>,
     leaves: Vec<Leaf>,
 }
@@ -59,12 +72,51 @@ impl PlantStructure {
     ///
     /// # Errors
     /// `Invalid` with the entry: invalid JSON, an unknown parent, a cycle, a number that exceeds f32, an empty
-    /// polyline, a negative radius, radii and vertices of different numbers, or a leaf that is not an object or is duplicated.
+    /// polyline, a negative radius, radii and vertices of different numbers, too many modes, or a leaf that is not an
+    /// object or is duplicated.
     pub(super) fn parse(bytes: &[u8]) -> Result<Self> {
         let file: StructureJson =
             serde_json::from_slice(bytes).map_err(|error| invalid("json", "objects, shoots and leaves", error))?;
+        if file.objects.is_none() {
+            return Err(invalid("json", "objects, shoots and leaves", "no objects"));
+        }
+        Self::validated(file)
+    }
+
+    /// As [`Self::parse`], for a plant without an OBJ file: `objects` is optional, and there are shoots, which have
+    /// radii and at least two different points.
+    ///
+    /// # Errors
+    /// As for [`Self::parse`].
+    pub(super) fn parse_without_meshes(bytes: &[u8]) -> Result<Self> {
+        let file: StructureJson =
+            serde_json::from_slice(bytes).map_err(|error| invalid("json", "shoots and leaves", error))?;
+        let structure = Self::validated(file)?;
+        if structure.shoots.is_empty() {
+            return Err(invalid("shoots", "at least one shoot", 0));
+        }
+        for Shoot { id, vertices, radii, .. } in &structure.shoots {
+            if radii.is_none() {
+                return Err(invalid(
+                    format!("shoot {id}: radii"),
+                    format!("{} (one per vertex)", vertices.len()),
+                    "none",
+                ));
+            }
+            if vertices.iter().all(|point| *point == vertices[0]) {
+                let given = format!("{} equal points", vertices.len());
+                return Err(invalid(format!("shoot {id}: vertices"), "at least two different points", given));
+            }
+        }
+        Ok(structure)
+    }
+
+    fn validated(file: StructureJson) -> Result<Self> {
         let parse_id = |id: &str| id.parse().map_err(|_| invalid("objects", "whole numbers as ids", id));
-        let objects = file.objects.into_iter().map(|(id, kind)| Ok((parse_id(&id)?, kind))).collect::<Result<_>>()?;
+        let objects = match file.objects {
+            Some(objects) => objects.into_iter().map(|(id, kind)| Ok((parse_id(&id)?, kind))).collect::<Result<_>>()?,
+            None => file.leaves.iter().map(|leaf| (leaf.object_id, "leaf".to_owned())).collect(),
+        };
         let shoot_indices: HashMap<_, _> =
             file.shoots.iter().enumerate().map(|(index, shoot)| (shoot.id, index)).collect();
         if shoot_indices.len() != file.shoots.len() {
@@ -76,6 +128,7 @@ impl PlantStructure {
         structure.check_polylines()?;
         structure.check_radii()?;
         structure.check_leaves()?;
+        structure.check_mode_counts()?;
         Ok(structure)
     }
 
@@ -87,10 +140,11 @@ impl PlantStructure {
     fn check_polylines(&self) -> Result<()> {
         let shoots = self.shoots.iter().map(|shoot| (format!("shoot {}", shoot.id), &shoot.vertices[..]));
         let leaves = self.leaves.iter().flat_map(|leaf| {
-            // The base of a leaf is checked as a polyline of one point.
+            // The base and the tip of a leaf are checked as polylines of one point.
             let base_point = std::slice::from_ref(&leaf.base);
             let petiole = leaf.petiole_vertices.as_deref().unwrap_or(base_point);
-            [petiole, base_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
+            let tip_point = leaf.tip.as_ref().map_or(base_point, std::slice::from_ref);
+            [petiole, base_point, tip_point].map(|polyline| (format!("leaf {}", leaf.object_id), polyline))
         });
         for (name, polyline) in shoots.chain(leaves) {
             if polyline.is_empty() || !polyline.as_flattened().iter().all(|coordinate| (*coordinate as f32).is_finite())
@@ -130,6 +184,20 @@ impl PlantStructure {
             }
             if self.shoot(leaf.shoot).is_none() {
                 return Err(invalid(field(), "the id of a shoot", leaf.shoot));
+            }
+            if let Some(width) = leaf.width.filter(|width| !((*width as f32).is_finite() && *width > 0.0)) {
+                return Err(invalid(format!("{}: width", field()), "a positive finite number", width));
+            }
+        }
+        Ok(())
+    }
+
+    fn check_mode_counts(&self) -> Result<()> {
+        let shoots = self.shoots.iter().map(|shoot| (shoot.modes, "shoot", shoot.id.to_string()));
+        let leaves = self.leaves.iter().map(|leaf| (leaf.modes, "leaf", leaf.object_id.to_string()));
+        for (modes, kind, id) in shoots.chain(leaves) {
+            if let Some(modes) = modes.filter(|modes| *modes > MAX_RANK) {
+                return Err(invalid(format!("{kind} {id}: modes"), format!("at most {MAX_RANK}"), modes));
             }
         }
         Ok(())
@@ -251,6 +319,26 @@ mod tests {
                 "leaf 2: expected the object_id",
             ),
             (shoot_json(0, -1), leaf_json(2, 0, "[0,0]"), "json: expected objects, shoots and leaves"),
+            (
+                shoot_json(0, -1),
+                leaf_json(2, 0, "[0,0,0], \"tip\": [0,-1e300,0]"),
+                "leaf 2: expected a polyline of finite points",
+            ),
+            (
+                shoot_json(0, -1),
+                leaf_json(2, 0, "[0,0,0], \"width\": 0"),
+                "leaf 2: width: expected a positive finite number, got 0",
+            ),
+            (
+                shoot_json(0, -1),
+                leaf_json(2, 0, "[0,0,0], \"modes\": 513"),
+                "leaf 2: modes: expected at most 512, got 513",
+            ),
+            (
+                r#"{"id": 4, "parent": -1, "vertices": [[0, 0, 0]], "modes": 1000}"#.into(),
+                String::new(),
+                "shoot 4: modes: expected at most 512, got 1000",
+            ),
         ] {
             let message = parse(&shoots, &leaves).expect_err(start).to_string();
             assert!(message.starts_with(start), "{message}");
@@ -259,6 +347,36 @@ mod tests {
             PlantStructure::parse("[".repeat(100_000).as_bytes()).is_err(),
             "expected an error instead of a stack overflow"
         );
+    }
+
+    #[test]
+    fn plants_without_meshes_need_shoots_with_radii() {
+        let parse = |shoots: &str, leaves: &str| {
+            let text = format!(r#"{{"shoots": [{shoots}], "leaves": [{leaves}]}}"#);
+            PlantStructure::parse_without_meshes(text.as_bytes())
+        };
+        let structure = parse(&shoot_with_radii("[0.5, 0]"), &leaf_json(7, 0, "[0,0,1]")).expect("a valid structure");
+        assert_eq!(structure.objects, BTreeMap::from([(7, "leaf".to_owned())]));
+        for (shoots, leaves, expected) in [
+            (String::new(), String::new(), "shoots: expected at least one shoot, got 0"),
+            (shoot_json(3, -1), String::new(), "shoot 3: radii: expected 1 (one per vertex), got none"),
+            (
+                shoot_with_radii("[1, 1]").replace("[0, 0, 1]", "[0, 0, 0]"),
+                String::new(),
+                "shoot 0: vertices: expected at least two different points, got 2 equal points",
+            ),
+            (
+                shoot_with_radii("[1, 1]"),
+                [leaf_json(2, 0, "[0,0,0]"), leaf_json(2, 0, "[0,0,0]")].join(","),
+                "leaf 2: expected the object_id of a leaf, without duplicates, got 2",
+            ),
+        ] {
+            assert_eq!(parse(&shoots, &leaves).expect_err(expected).to_string(), expected);
+        }
+        // A plant with an OBJ file needs its objects.
+        let text = format!(r#"{{"shoots": [{}], "leaves": []}}"#, shoot_with_radii("[1, 1]"));
+        let message = PlantStructure::parse(text.as_bytes()).expect_err("no objects").to_string();
+        assert_eq!(message, "json: expected objects, shoots and leaves, got no objects");
     }
 
     #[test]
