@@ -84,6 +84,36 @@ fn quick_report_is_complete_and_consistent() {
 }
 
 #[test]
+fn quick_plant_is_simulated_and_drawn_by_both_systems() {
+    let folder = tempfile::tempdir().expect("expected a folder");
+    let (code, output) = run_report(folder.path(), &["plant-2-png-1080p*"]);
+    assert_eq!(code, Some(0), "{output}");
+    let report: Value = serde_json::from_slice(&read(folder.path(), "report.json")).expect("expected JSON");
+    let cases = report["cases"].as_array().expect("expected cases");
+    let names: Vec<&str> = cases.iter().filter_map(|case| case["name"].as_str()).collect();
+    assert_eq!(names, ["plant-2-png-1080p", "plant-2-png-1080p-cpu"]);
+    for case in cases {
+        let plant = &case["result"]["plant"];
+        assert_eq!(plant["thesis"]["name"], "Conifer");
+        // The conifer has 644 domains, of which 43 have 360 modes. A quick report has a sixteenth of them.
+        let counts = ["domains", "deformable", "modes"].map(|name| plant["counts"][name].as_u64());
+        assert_eq!(counts, [Some(41), Some(3), Some(23)], "{case}");
+        for rate in [&plant["rate"]["per_second"], &plant["recorded_per_second"], &plant["physics_per_second"]] {
+            assert!(rate.as_f64().is_some_and(|rate| rate > 0.0 && rate.is_finite()), "{case}");
+        }
+        assert_eq!((&plant["rate"]["steps"], &plant["rate"]["skipped"]), (&6.into(), &0.into()));
+        for stage in ["deform", "shadow", "draw"] {
+            assert!(plant["rate"]["alone_ms"][0][stage].as_f64().is_some_and(|ms| ms > 0.0), "{stage} of {case}");
+        }
+    }
+    assert_eq!(cases[1]["result"]["plant"]["backend"], "cpu");
+    assert!(cases[1]["server"].as_str().is_some_and(|server| server.starts_with("deforms on cpu")), "{}", cases[1]);
+    let markdown = String::from_utf8(read(folder.path(), "report.md")).expect("expected text");
+    let row = markdown.lines().find(|line| line.starts_with("| Conifer |")).expect("expected a row of the table");
+    assert!(row.contains("| 41 | 3 | 23 |") && row.ends_with("| 1.059, 1.693 | 55, 60 | 0.92 |"), "{row}");
+}
+
+#[test]
 fn unknown_case_is_an_error_without_files() {
     let folder = tempfile::tempdir().expect("expected a folder");
     let (code, output) = run_report(folder.path(), &["tree-gif"]);

@@ -27,7 +27,7 @@ pub(super) struct Args {
     /// Output folder; files of an earlier report there are replaced.
     #[arg(long)]
     out: PathBuf,
-    /// Folder of scenes that contains plants/almond and vega/simpleBridge. Default: only generated scenes.
+    /// Folder of scenes that contains plants/almond, plants/bean and vega/simpleBridge. Default: only generated scenes.
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
     /// Measure only this case, or all cases with this prefix: "tree-delay*"; repeatable.
@@ -96,6 +96,13 @@ fn case_lines(case: &CaseReport) -> Vec<String> {
             let slowest = result.stage_rates.first().map(|rate| rate.line()).unwrap_or_default();
             let (per_second, fraction) = (result.per_second, result.of_slowest_stage);
             vec![line(format!("{per_second:>9.1} /s  {fraction:.2} of {slowest}"))]
+        }
+        CaseResult::Plant(plant) => {
+            let (simulated, recorded, physics) =
+                (plant.rate.per_second, plant.recorded_per_second, plant.physics_per_second);
+            vec![line(format!(
+                "{simulated:>9.1} /s  {recorded:.1} of recorded steps, {physics:.1} steps/s of the physics"
+            ))]
         }
         CaseResult::Latency(result) => {
             let (p50, p90, p99, max) = (result.p50_ms, result.p90_ms, result.p99_ms, result.max_ms);

@@ -4,8 +4,9 @@ use super::contention::OtherWork;
 use super::delay::DelayedStream;
 use super::peers::viewer::Content;
 use super::rates::Viewers;
-use super::session::SceneSource;
+use super::session::{SceneSource, ServerBackend};
 use super::{QUICK_DIVISOR, StreamReportOptions};
+use crate::thesis::PLANTS;
 use crate::workloads::Size;
 
 /// One case.
@@ -14,6 +15,7 @@ pub(super) struct Case {
     /// The name states the full sizes; a quick report has smaller pictures.
     pub(super) name: &'static str,
     pub(super) scene: SceneSource,
+    pub(super) backend: ServerBackend,
     pub(super) measurement: Measurement,
 }
 
@@ -36,6 +38,14 @@ pub(super) enum Measurement {
     PictureEncodings(Content),
     /// Rates beside those of a Python program, with pictures of this width and height.
     Afternoon([u32; 2]),
+    /// Rate of one viewer of a plant, with the columns of tables 4.5 to 4.7 of the thesis.
+    Plant(Content),
+}
+
+impl Case {
+    const fn new(name: &'static str, scene: SceneSource, measurement: Measurement) -> Self {
+        Self { name, scene, backend: ServerBackend::Default, measurement }
+    }
 }
 
 /// The contents that several cases have.
@@ -80,7 +90,8 @@ pub(super) fn all(options: &StreamReportOptions) -> Vec<Case> {
     if options.scenes.is_some() {
         cases.extend(repository_cases(&contents, latency_steps(options)));
     }
-    cases.push(Case { name: "grid-socket", scene: SceneSource::Grid, measurement: Measurement::Socket });
+    cases.push(Case::new("grid-socket", SceneSource::Grid, Measurement::Socket));
+    cases.extend(plant_cases(contents.png_1080p, options.scenes.is_some()));
     cases
 }
 
@@ -110,7 +121,7 @@ fn tree_cases(contents: &Contents, [frames, acknowledgments]: [u64; 2]) -> Vec<C
         ("tree-picture-encodings", Measurement::PictureEncodings(contents.raw_1080p)),
         ("tree-afternoon", Measurement::Afternoon(contents.size_1080p)),
     ];
-    cases.map(|(name, measurement)| Case { name, scene: SceneSource::Tree, measurement }).into()
+    cases.map(|(name, measurement)| Case::new(name, SceneSource::Tree, measurement)).into()
 }
 
 fn repository_cases(contents: &Contents, [frames, _]: [u64; 2]) -> Vec<Case> {
@@ -131,7 +142,34 @@ fn repository_cases(contents: &Contents, [frames, _]: [u64; 2]) -> Vec<Case> {
         ("bridge-steps", BRIDGE, Measurement::Rate(None)),
         ("bridge-delay-steps", BRIDGE, Measurement::Delay(DelayedStream::Steps)),
     ];
-    cases.map(|(name, scene, measurement)| Case { name, scene, measurement }).into()
+    cases.map(|(name, scene, measurement)| Case::new(name, scene, measurement)).into()
+}
+
+/// The names of the cases of a plant, by the default backend and by the CPU.
+macro_rules! plant_names {
+    ($($name:literal),*) => { [$([concat!($name, "-png-1080p"), concat!($name, "-png-1080p-cpu")]),*] };
+}
+
+/// Cases of the generated plants, in the order of table 4.5.
+const SKELETON_CASES: [[&str; 2]; PLANTS.len()] = plant_names!(
+    "plant-1", "plant-2", "plant-3", "plant-4", "plant-5", "plant-6", "plant-7", "plant-8", "plant-9", "plant-10",
+    "plant-11", "plant-12"
+);
+
+/// Cases of the plants of a folder.
+const REAL_PLANTS: [([&str; 2], SceneSource); 2] = {
+    let [almond, bean] = plant_names!("plant-almond", "plant-bean");
+    [(almond, SceneSource::ALMOND), (bean, SceneSource::BEAN)]
+};
+
+fn plant_cases(content: Content, has_folder: bool) -> Vec<Case> {
+    let skeletons = SKELETON_CASES.iter().enumerate().map(|(index, names)| (*names, SceneSource::Skeleton(index)));
+    let real_plants = REAL_PLANTS.into_iter().filter(|_| has_folder);
+    let pair = |([by_default, by_cpu], scene): ([&'static str; 2], SceneSource)| {
+        let case = Case::new(by_default, scene, Measurement::Plant(content));
+        [case, Case { name: by_cpu, backend: ServerBackend::Cpu, ..case }]
+    };
+    real_plants.chain(skeletons).flat_map(pair).collect()
 }
 
 /// Lines that describe the cases, for the help text.
@@ -158,10 +196,15 @@ pub(crate) const CASE_HELP: &str = "Cases:
                  opencv-python-headless and numpy in MODALCAST_PYTHON; uses cupy on a GPU)
   almond-*, bridge-*
                  scenes of --scenes: png, vertices, steps, of the almond also latency, encodings and the
-                 Python program, and of the bridge also steps over a round trip of 50 ms";
+                 Python program, and of the bridge also steps over a round trip of 50 ms
+  plant-1-png-1080p .. plant-12-png-1080p, plant-almond-png-1080p, plant-bean-png-1080p, each also with -cpu
+                 generated plants with the counts of table 4.5 of the thesis, and the almond and the bean of
+                 --scenes: deformation, drawing, simulation, and frames per second with and without the
+                 simulation; -cpu is the same server with --backend cpu";
 
 #[cfg(test)]
 mod tests {
+    use super::super::skeletons;
     use super::*;
 
     #[test]
@@ -180,7 +223,8 @@ mod tests {
         }
         let mut scenes: Vec<&str> = cases.iter().map(|case| case.scene.name()).collect();
         scenes.dedup();
-        assert_eq!(scenes, ["tree", "plants/almond", "vega/simpleBridge", "grid"]);
+        assert_eq!(scenes[..6], ["tree", "plants/almond", "vega/simpleBridge", "grid", "plants/almond", "plants/bean"]);
+        assert_eq!(scenes[6..], skeletons::FILES);
         let without_folder = all(&StreamReportOptions { scenes: None, ..options });
         assert!(without_folder.iter().all(|case| !matches!(case.scene, SceneSource::Repository(_))));
     }

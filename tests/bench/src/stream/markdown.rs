@@ -8,7 +8,7 @@ use super::peers::socket::SocketComparison;
 use super::picture_encodings::PictureEncodingRow;
 use super::rates::RateResult;
 use super::vertex_encodings::VertexEncodingRow;
-use super::{CaseReport, CaseResult, StreamReport};
+use super::{CaseReport, CaseResult, StreamReport, plants};
 use crate::markdown_table::{dash, table};
 
 /// How a rate and the rates of the stages are defined.
@@ -42,6 +42,8 @@ pub(super) fn markdown(report: &StreamReport) -> String {
         text.push_str(&format!("\nFailed:\n\n- {}\n", report.failed.join("\n- ")));
     }
     text.push_str(&rate_section(report));
+    let plant_rows = plants::table_rows(report);
+    text.push_str(&section("Plants: tables 4.5 to 4.7 of the thesis", plants::NOTE, &plants::HEADER, plant_rows));
     text.push_str(&latency_section(report));
     text.push_str(&socket_section(report));
     text.push_str(&contention_section(report));
@@ -66,10 +68,7 @@ fn section(title: &str, note: &str, head: &[&str], rows: Vec<Vec<String>>) -> St
 }
 
 fn rate_section(report: &StreamReport) -> String {
-    let rates = select(report, |result| match result {
-        CaseResult::Rate(result) => Some(result),
-        _ => None,
-    });
+    let rates = select(report, CaseResult::rate);
     let row = |(case, result): &(&CaseReport, &RateResult)| {
         let slowest = result.stage_rates.first();
         let runs: Vec<String> = result.runs.iter().map(|rate| format!("{rate:.1}")).collect();

@@ -4,9 +4,10 @@
 //! - `processes` starts and ends child processes. The benchmark also starts its own program as a child, which then has
 //!   one of the roles in `peers`: `viewer`, `socket` (a plain TCP connection) and `proxy` (a delaying connection).
 //! - `session` is a server with one scene. `motion` records steps, so that they can be sent from memory. `grid` is a
-//!   scene of many vertices.
+//!   scene of many vertices, and `skeletons` are plants with the counts of the thesis.
 //! - `cases` lists the cases. Each case makes one measurement: `rates` with `stages`, `latency`, `socket`,
-//!   `contention`, `delay`, `vertex_encodings`, `picture_encodings` or `afternoon`.
+//!   `contention`, `delay`, `vertex_encodings`, `picture_encodings`, `afternoon` or `plants` (tables 4.5 to 4.7 of the
+//!   thesis).
 //! - `afternoon` compares the server with a Python program that a user could write in an afternoon
 //!   (`tests/bench/peers/afternoon.py`). `afternoon_scene` writes a scene for this program.
 //! - `output`, `markdown` and `plot` write the report.
@@ -23,10 +24,12 @@ mod motion;
 mod output;
 pub(crate) mod peers;
 pub mod picture_encodings;
+pub mod plants;
 mod plot;
 mod processes;
 pub mod rates;
 mod session;
+mod skeletons;
 pub mod stages;
 pub mod vertex_encodings;
 
@@ -46,6 +49,7 @@ use latency::LatencyResult;
 use modalcast_model::error::{Result, invalid};
 use peers::socket::{SocketComparison, SocketJob, VertexViewers};
 use picture_encodings::PictureEncodingRow;
+use plants::PlantRates;
 use rates::RateResult;
 pub use session::SceneLook;
 use session::Session;
@@ -63,7 +67,8 @@ const QUICK_DIVISOR: u32 = 4;
 /// Settings of a report.
 #[derive(Debug, Clone)]
 pub struct StreamReportOptions {
-    /// Folder of scenes with `plants/almond` and `vega/simpleBridge`. Without it, only generated scenes are measured.
+    /// Folder of scenes with `plants/almond`, `plants/bean` and `vega/simpleBridge`. Without it, only generated scenes
+    /// are measured.
     pub scenes: Option<PathBuf>,
     /// Cases to measure: full names, or prefixes that end in `*`. An empty list selects all.
     pub cases: Vec<String>,
@@ -123,6 +128,7 @@ pub enum CaseResult {
     VertexEncodings(Vec<VertexEncodingRow>),
     PictureEncodings(Vec<PictureEncodingRow>),
     Afternoon(AfternoonComparison),
+    Plant(Box<PlantRates>),
 }
 
 /// Progress events of a running report.
@@ -187,9 +193,9 @@ fn measure_case(
     options: &StreamReportOptions,
     report: &StreamReport,
 ) -> Result<CaseReport> {
-    let reusable = session.take().filter(|session| session.source == case.scene);
+    let reusable = session.take().filter(|session| session.source == case.scene && session.backend == case.backend);
     // The previous server has ended here, unless its scene is the same.
-    let session = session.insert(reusable.map_or_else(|| Session::open(case.scene, options), Ok)?);
+    let session = session.insert(reusable.map_or_else(|| Session::open(case.scene, case.backend, options), Ok)?);
     let result = match case.measurement {
         Measurement::Rate(viewers) => rates::measure(session, viewers, options).map(CaseResult::Rate),
         Measurement::FrameLatency(content, steps) => {
@@ -206,6 +212,9 @@ fn measure_case(
             picture_encodings::measure(session, content, options).map(CaseResult::PictureEncodings)
         }
         Measurement::Afternoon(size) => afternoon::measure(session, size, options).map(CaseResult::Afternoon),
+        Measurement::Plant(content) => {
+            plants::measure(session, content, options).map(|plant| CaseResult::Plant(Box::new(plant)))
+        }
     }?;
     let server = &session.server_info;
     Ok(CaseReport {
@@ -259,6 +268,17 @@ impl StreamReport {
     /// Whether all cases were measured and no encoding exceeds its bound.
     pub fn passed(&self) -> bool {
         self.failed.is_empty()
+    }
+}
+
+impl CaseResult {
+    /// The rate of a case that has one.
+    fn rate(&self) -> Option<&RateResult> {
+        match self {
+            Self::Rate(rate) => Some(rate),
+            Self::Plant(plant) => Some(&plant.rate),
+            _ => None,
+        }
     }
 }
 

@@ -8,6 +8,7 @@ use super::delay::DelayResult;
 use super::latency::LatencyResult;
 use super::peers::socket::SocketComparison;
 use super::picture_encodings::PictureEncodingRow;
+use super::plants::{PlantCounts, PlantRates};
 use super::rates::RateResult;
 use super::vertex_encodings::VertexEncodingRow;
 use super::{CaseReport, CaseResult, StreamReport, markdown, plot};
@@ -109,8 +110,24 @@ impl CaseResult {
             Self::VertexEncodings(rows) => rows.iter().flat_map(vertex_quantities).collect(),
             Self::PictureEncodings(rows) => rows.iter().flat_map(picture_quantities).collect(),
             Self::Afternoon(comparison) => afternoon_quantities(comparison),
+            Self::Plant(plant) => plant_quantities(plant),
         }
     }
+}
+
+fn plant_quantities(plant: &PlantRates) -> Vec<Quantity> {
+    let PlantCounts { vertices, triangles, domains, deformable, modes, rows } = plant.counts;
+    let mut quantities = rate_quantities(&plant.rate);
+    quantities.extend([
+        quantity("rate of recorded steps", plant.recorded_per_second, "1/s"),
+        quantity("vertices", vertices as f64, "1"),
+        quantity("triangles", triangles as f64, "1"),
+        quantity("domains", domains as f64, "1"),
+        quantity("domains with modes", deformable as f64, "1"),
+        quantity("modes", modes as f64, "1"),
+        quantity("rows of U", rows as f64, "1"),
+    ]);
+    quantities
 }
 
 fn rate_quantities(result: &RateResult) -> Vec<Quantity> {

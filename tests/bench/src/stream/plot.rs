@@ -50,9 +50,7 @@ pub(super) fn draw_svg(report: &StreamReport) -> String {
 fn rates_by_case(report: &StreamReport) -> Vec<(&str, &RateResult)> {
     let mut rates = Vec::new();
     for case in &report.cases {
-        if let CaseResult::Rate(rate) = &case.result {
-            rates.push((case.name, rate));
-        }
+        rates.extend(case.result.rate().map(|rate| (case.name, rate)));
     }
     rates
 }

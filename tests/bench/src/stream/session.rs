@@ -15,7 +15,7 @@ use tokio::runtime::Runtime;
 use super::grid;
 use super::motion::Motion;
 use super::processes::{Process, Program, arguments};
-use super::{QUICK_DIVISOR, SCENE, StreamReportOptions, peers};
+use super::{QUICK_DIVISOR, SCENE, StreamReportOptions, peers, skeletons};
 use crate::workloads::Size;
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Error, Result, fault_in};
@@ -32,12 +32,23 @@ pub(super) enum SceneSource {
     Tree,
     /// A scene in the folder `--scenes`.
     Repository(&'static str),
+    /// A generated plant with the counts of a row of table 4.5 of the thesis, counted from 0.
+    Skeleton(usize),
     /// A generated grid ([`grid`]), which is not drawn.
     Grid,
 }
 
+/// The backend of a server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ServerBackend {
+    /// The one that the server selects on this machine.
+    Default,
+    Cpu,
+}
+
 impl SceneSource {
     pub(super) const ALMOND: Self = Self::Repository("plants/almond");
+    pub(super) const BEAN: Self = Self::Repository("plants/bean");
     pub(super) const BRIDGE: Self = Self::Repository("vega/simpleBridge");
 
     /// The name that clients open.
@@ -45,6 +56,7 @@ impl SceneSource {
         match self {
             Self::Tree => "tree",
             Self::Repository(path) => path,
+            Self::Skeleton(index) => skeletons::FILES[index],
             Self::Grid => grid::NAME,
         }
     }
@@ -92,6 +104,7 @@ impl SceneLook {
 /// A running server with one open scene.
 pub(super) struct Session {
     pub(super) source: SceneSource,
+    pub(super) backend: ServerBackend,
     pub(super) runtime: Runtime,
     pub(super) client: Client,
     pub(super) server_info: ServerInfo,
@@ -115,7 +128,7 @@ impl Session {
     ///
     /// # Errors
     /// `Fault` when the server fails; errors of loading the scene.
-    pub(super) fn open(source: SceneSource, options: &StreamReportOptions) -> Result<Self> {
+    pub(super) fn open(source: SceneSource, backend: ServerBackend, options: &StreamReportOptions) -> Result<Self> {
         let work = create_work_folder()?;
         // The path of a scene that is drawn.
         let (repository, drawn_scene) = match source {
@@ -125,12 +138,16 @@ impl Session {
                 let path = folder.join(path);
                 (Some(folder), Some(path))
             }
+            SceneSource::Skeleton(index) => {
+                skeletons::write(work.path(), index, options.size)?;
+                (Some(work.path().to_owned()), Some(work.path().join(source.name())))
+            }
             SceneSource::Grid => {
                 grid::write(work.path(), grid::side(options.size))?;
                 (Some(work.path().to_owned()), None)
             }
         };
-        let mut server = start_server(work.path(), repository.as_deref(), drawn_scene.is_some())?;
+        let mut server = start_server(work.path(), repository.as_deref(), drawn_scene.is_some(), backend)?;
         let url = server.wait_for("listening on ")?;
         let address = url.trim_start_matches("http://").parse().map_err(fault_in("report"))?;
         let runtime = peers::start_runtime()?;
@@ -149,6 +166,7 @@ impl Session {
         let look = drawn_scene.map(|path| SceneLook::of(&path.to_string_lossy(), renderer, pixels)).transpose()?;
         Ok(Self {
             source,
+            backend,
             runtime,
             client,
             server_info,
@@ -167,7 +185,9 @@ impl Session {
     pub(super) fn path(&self) -> String {
         match self.source {
             SceneSource::Tree => self.source.name().to_owned(),
-            SceneSource::Repository(_) | SceneSource::Grid => self.files.to_string_lossy().into_owned(),
+            SceneSource::Repository(_) | SceneSource::Skeleton(_) | SceneSource::Grid => {
+                self.files.to_string_lossy().into_owned()
+            }
         }
     }
 
@@ -219,7 +239,7 @@ impl Session {
         let description = self.runtime.block_on(self.client.describe(SCENE, &[])).map_err(fault_in("report"))?;
         let motion = match self.source {
             SceneSource::Grid => Motion::oscillation(&description, steps),
-            SceneSource::Tree | SceneSource::Repository(_) => {
+            SceneSource::Tree | SceneSource::Repository(_) | SceneSource::Skeleton(_) => {
                 let folder = self.recording();
                 self.start_physics(steps, &arguments([&"--record", &folder]))?.finish::<Value>()?;
                 Motion::read(&folder, &description)?
@@ -244,13 +264,16 @@ fn shared_memory_socket(work: &Path) -> PathBuf {
     work.join("memory.sock")
 }
 
-fn start_server(work: &Path, repository: Option<&Path>, draws: bool) -> Result<Process> {
+fn start_server(work: &Path, repository: Option<&Path>, draws: bool, backend: ServerBackend) -> Result<Process> {
     let state = work.join("state");
     let unix_address = format!("unix:{}", unix_socket(work).display());
     let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--listen", &unix_address, &"--state", &state]);
     list.extend(arguments([&"--shared-memory", &shared_memory_socket(work)]));
     if let Some(repository) = repository {
         list.extend(arguments([&"--scenes", &repository]));
+    }
+    if backend == ServerBackend::Cpu {
+        list.extend(arguments([&"--backend", &"cpu"]));
     }
     if !draws {
         list.extend(arguments([&"--renderer", &"off"]));

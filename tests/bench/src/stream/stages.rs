@@ -13,6 +13,9 @@ use serde::Serialize;
 use super::peers::viewer::Content;
 use modalcast::frame::PngLayout;
 
+/// The name of the physics process among the stages.
+pub(super) const PHYSICS_STAGE: &str = "physics process";
+
 /// The stages that run one after the other on the GPU, or on the CPU if the machine has no GPU. `switch` is the change of
 /// the GPU from CUDA to OpenGL.
 const DEVICE_STAGES: [&str; 5] = ["deform", "upload", "switch", "shadow", "draw"];
@@ -67,7 +70,7 @@ impl StageInputs<'_> {
     /// The rates of all stages, the slowest first.
     pub(super) fn rates(&self) -> Vec<StageRate> {
         let mut rates = vec![StageRate::new(
-            "physics process",
+            PHYSICS_STAGE,
             1e3 / self.physics_per_second,
             "one process that computes and sends steps",
             1,

@@ -17,7 +17,7 @@ fn encoding_row(encoding: &'static str, of_bound: f64) -> VertexEncodingRow {
     }
 }
 
-fn rate_result() -> RateResult {
+pub(super) fn rate_result() -> RateResult {
     let stage_rates = vec![StageRate {
         stages: "draw and shadow".into(),
         ms: 2.5,
@@ -42,7 +42,7 @@ fn rate_result() -> RateResult {
     }
 }
 
-fn case(name: &'static str, result: CaseResult) -> CaseReport {
+pub(super) fn case(name: &'static str, result: CaseResult) -> CaseReport {
     let look = serde_json::json!({ "antialias": "msaa", "raster": "opengl", "shadow": { "method": "variance", "fit": "vertices" } });
     CaseReport {
         name,
@@ -57,7 +57,7 @@ fn case(name: &'static str, result: CaseResult) -> CaseReport {
     }
 }
 
-fn report(cases: Vec<CaseReport>) -> StreamReport {
+pub(super) fn report(cases: Vec<CaseReport>) -> StreamReport {
     StreamReport {
         provenance: Provenance::collect(),
         build: modalcast::BUILD,
