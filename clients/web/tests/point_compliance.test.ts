@@ -68,6 +68,28 @@ test("a turned and scaled part has its limit in world axes", () => {
     assertClose(compliance?.limit([0, 1, 0]), (0.1 * deflections.size(0)) / (4 * 0.08));
 });
 
+test("a model of large motion bends by half its size, unless its material collapses earlier", () => {
+    const limitWith = (safeCoordinates?: string) => {
+        const { model, corner, deflections } = setUp([100, 25]);
+        const [domain] = model.scene.domains;
+        assert.ok(domain);
+        if (safeCoordinates !== undefined) domain.notes["modes.safe_coordinates"] = safeCoordinates;
+        const compliance = pointCompliance(model, corner([0, 1, 0]), deflections, 10);
+        const limit = compliance?.limit([1, 0, 0]);
+        return { limit, reason: compliance?.limitReason, size: deflections.size(0) };
+    };
+    const linear = limitWith();
+    assertClose(linear.limit, (0.1 * linear.size) / 0.02);
+    assert.equal(linear.reason, "The limit bends the part by 10 % of its size.");
+    const large = limitWith("1.5e1 2");
+    assertClose(large.limit, (0.5 * large.size) / 0.02);
+    assert.equal(large.reason, "The limit bends the part by 50 % of its size.");
+    // q is 1 / 100 per newton in mode 0, and 0 in mode 1.
+    const soft = limitWith("5e-3 1e-9");
+    assertClose(soft.limit, 0.5);
+    assert.equal(soft.reason, "Beyond the limit, the material may collapse under compression.");
+});
+
 test("without arrays, the point and the scene stand for the body", () => {
     const { model, corner } = setUp([100, 25]);
     const compliance = pointCompliance(model, corner([0, 1, 0]), null, 10);

@@ -5,7 +5,7 @@
  */
 
 import { applyLinear, norm, TRANSFORM_SIZE, type Vec3 } from "../scene/affine";
-import { type Deflections, LARGEST_DEFLECTION } from "../scene/deflection";
+import { type Deflections, LARGEST_DEFLECTION, LARGEST_LARGE_MOTION } from "../scene/deflection";
 import { eigenvaluesOf, largestRigidEigenvalue } from "../scene/description";
 import { at } from "../scene/numbers";
 import type { SceneModel } from "../scene/scene_model";
@@ -14,27 +14,55 @@ import type { SurfacePoint } from "./surface_point";
 /** Cosine of 1 degree. The limit is computed again only if the direction changes by more. */
 const SAME_DIRECTION = Math.cos(Math.PI / 180);
 
+/** The note with the coordinates of the linear modes up to which the material of a model of large motion holds. */
+const SAFE_COORDINATES = "modes.safe_coordinates";
+
+/** How far a body may be pulled. */
+export interface PullRange {
+    /** Largest deflection as a fraction of the size of the body. */
+    fraction: number;
+    /** Largest coordinates of the first modes; empty if they are unknown. */
+    safeCoordinates: number[];
+}
+
+/** The range of a body with these notes. Linear modes are wrong further out; a model of large motion is not. */
+export function pullRange(notes: { [name: string]: string }): PullRange {
+    const safe = notes[SAFE_COORDINATES];
+    if (safe === undefined) return { fraction: LARGEST_DEFLECTION, safeCoordinates: [] };
+    const numbers = safe.split(" ").map(Number);
+    return { fraction: LARGEST_LARGE_MOTION, safeCoordinates: numbers.filter((number) => number > 0) };
+}
+
 export class PointCompliance {
     private lastDirection: Vec3 = [0, 0, 0];
     private lastLimit = Infinity;
+    private isMaterialLimit = false;
 
     /**
      * @param responses q per newton in the direction of each world axis.
      * @param stiffness Newtons per scene unit: the inverse of the sum of the compliances along the three axes. The sum
      *   is at least the compliance in any direction, so the point does not pass the cursor.
      * @param largestDeflection Largest deflection of the body in meters at coordinates q.
-     * @param allowed Largest allowed deflection in meters.
+     * @param size Size of the body in meters.
+     * @param range How far the body may be pulled.
      */
     constructor(
         private readonly responses: readonly Float64Array[],
         readonly stiffness: number,
         private readonly largestDeflection: (q: Float64Array) => number,
-        private readonly allowed: number,
+        private readonly size: number,
+        private readonly range: PullRange,
     ) {}
 
+    /** The reason for the last limit, for users. */
+    get limitReason(): string {
+        if (this.isMaterialLimit) return "Beyond the limit, the material may collapse under compression.";
+        return `The limit bends the part by ${100 * this.range.fraction} % of its size.`;
+    }
+
     /**
-     * The force in newtons whose static deflection of the body is the allowed one, for a direction. Infinite if nothing
-     * bends.
+     * The force in newtons whose static deflection of the body by linear modes is the largest one of the range, for a
+     * direction. Infinite if nothing bends.
      */
     limit(direction: Vec3): number {
         const length = norm(direction);
@@ -47,14 +75,20 @@ export class PointCompliance {
             for (let mode = 0; mode < q.length; mode++) q[mode] = at(q, mode) + at(unit, axis) * at(response, mode);
         });
         this.lastDirection = unit;
-        this.lastLimit = this.allowed / this.largestDeflection(q);
+        const ofSize = (this.range.fraction * this.size) / this.largestDeflection(q);
+        const ofMaterial = this.range.safeCoordinates.reduce(
+            (least, safe, mode) => Math.min(least, safe / Math.abs(q[mode] ?? 0)),
+            Infinity,
+        );
+        this.isMaterialLimit = ofMaterial < ofSize;
+        this.lastLimit = Math.min(ofSize, ofMaterial);
         return this.lastLimit;
     }
 }
 
 /**
- * The compliance at a point; null if no mode has stiffness. The allowed deflection is a fraction of the size of the
- * body. Without `deflections`, the deflection of the pulled point is used instead of the body's, and the diagonal of
+ * The compliance at a point; null if no mode has stiffness. The largest deflection is a fraction of the size of the
+ * body ({@link pullRange}). Without `deflections`, the deflection of the pulled point is used instead of the body's, and the diagonal of
  * the scene (in scene units) instead of the body's size.
  */
 export function pointCompliance(
@@ -91,6 +125,7 @@ export function pointCompliance(
         responses,
         1 / compliance,
         deflections ? largestOfBody : largestOfPoint,
-        LARGEST_DEFLECTION * size,
+        size,
+        pullRange(scene.domains[domain]?.notes ?? {}),
     );
 }

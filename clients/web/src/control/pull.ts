@@ -36,6 +36,8 @@ export interface PullView {
     limit: number | null;
     /** Whether the force is at its limit. */
     isLimited: boolean;
+    /** The reason for the limit; empty if it is unknown. */
+    limitReason: string;
     /** Deflection of the point in meters. */
     deflection: number;
 }
@@ -81,7 +83,8 @@ export class PullTool {
         const newtons = norm(this.force(to));
         const limit = this.compliance?.limit(subtract(to, this.anchor)) ?? null;
         const isLimited = limit !== null && newtons > 0.999 * limit;
-        return { from, to, newtons, limit, isLimited, deflection: deflectionAt(this.model, this.point) };
+        const limitReason = this.compliance?.limitReason ?? "";
+        return { from, to, newtons, limit, isLimited, limitReason, deflection: deflectionAt(this.model, this.point) };
     }
 
     /** Starts a pull at a pixel of the viewport, which has `size` (width and height) pixels. */

@@ -4,7 +4,7 @@ import type { SceneInfo } from "../proto/modalcast/v1/scenes_pb";
 import { rankOf, type SceneDescription } from "../scene/description";
 import { mayBeInMillimeters } from "./scene_upload";
 
-const MODEL_FILE = /[^/\\]+\.(glb|gltf|obj|ply|stl|npz)$/i;
+const MODEL_FILE = /[^/\\]+\.(glb|gltf|obj|ply|stl|npz|structure\.json)$/i;
 
 /** The command that opens the model of a scene with further options. */
 export function viewCommand(info: Pick<SceneInfo, "source" | "unit" | "remarks">, options: string): string {

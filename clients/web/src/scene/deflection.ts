@@ -16,6 +16,8 @@ const MAX_ENTRIES = 3e6;
 
 /** Limit of sliders and pulls: deflection as a fraction of the body's size. Linear modes are wrong for larger ones. */
 export const LARGEST_DEFLECTION = 0.1;
+/** As `LARGEST_DEFLECTION`, for pulls on a model of large motion (`modalcast model --large`). */
+export const LARGEST_LARGE_MOTION = 0.5;
 
 /** The vertices of a shape that are evaluated. */
 interface EvaluatedVertices {

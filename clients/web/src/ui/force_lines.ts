@@ -4,7 +4,6 @@ import type { PullView } from "../control/pull";
 import { positionOf, surfacePoint } from "../control/surface_point";
 import type { OrbitCamera } from "../render/camera";
 import { addScaled, norm, subtract, type Vec3 } from "../scene/affine";
-import { LARGEST_DEFLECTION } from "../scene/deflection";
 import type { SceneSession } from "../session";
 import * as format from "./format";
 import { Overlay, type OverlayLine } from "./overlay";
@@ -61,9 +60,9 @@ export class ForceLines {
  *
  * @param largest Largest deflection of the part in meters; null if it is unknown.
  */
-function pullText({ newtons, limit, deflection, isLimited }: PullView, largest: number | null): string {
+function pullText({ newtons, limit, deflection, isLimited, limitReason }: PullView, largest: number | null): string {
     const lines = [format.limitedNewtons(newtons, limit), `${format.meters(deflection)} at the pulled point`];
     if (largest !== null) lines.push(`${format.meters(largest)} largest`);
-    if (isLimited) lines.push(`The limit bends the part by ${100 * LARGEST_DEFLECTION} % of its size.`);
+    if (isLimited) lines.push(limitReason);
     return lines.join("\n");
 }
