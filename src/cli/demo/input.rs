@@ -9,6 +9,10 @@ use modalcast_model::error::Result;
 use modalcast_model::load;
 use modalcast_model::scene::Scene;
 
+/// Deflection of a body with cubic forces in the demo, as a fraction of the diagonal. Without it, no load would act on
+/// a model of `modalcast model --large`.
+const DEMO_DEFLECTION: &str = "0.03";
+
 /// Where a scene is, without its content.
 pub(in crate::cli) struct SceneLocation {
     /// Name or path of the scene in the server's repository.
@@ -36,6 +40,12 @@ impl ForceFiles {
         let options =
             [("--cubic", text(&self.cubic)), ("--config", text(&self.config)), ("--domain", self.domain.clone())];
         options.into_iter().filter_map(|(flag, value)| Some([flag.to_owned(), value?])).flatten().collect()
+    }
+
+    /// [`Self::flags`], with a load for a body with cubic forces.
+    pub(super) fn demo_flags(&self) -> Vec<String> {
+        let load = self.cubic.iter().flat_map(|_| ["--deflection".to_owned(), DEMO_DEFLECTION.to_owned()]);
+        self.flags().into_iter().chain(load).collect()
     }
 }
 
@@ -132,8 +142,9 @@ mod tests {
         assert_eq!((file_name(&beam.cubic), file_name(&beam.config)), (Some("a.cub".into()), Some("a.config".into())));
         let flags = beam.flags();
         assert_eq!((flags.len(), &flags[4..]), (6, &["--domain".to_owned(), "a".to_owned()][..]));
+        assert_eq!(beam.demo_flags(), [&flags[..], &["--deflection".to_owned(), "0.03".to_owned()]].concat());
         let (_, other) = locate("other");
-        assert_eq!(other.flags(), [""; 0], "expected no guess");
+        assert_eq!((other.flags(), other.demo_flags()), (vec![], vec![]), "expected no guess and no load");
         // `tree` is the built-in scene, although a folder has this name. `./tree` is the folder.
         let (built_in, files) = locate("tree");
         assert_eq!((built_in.source.as_str(), built_in.repository, files.cubic), ("tree", None, None));

@@ -28,6 +28,7 @@ use step_records::StepRecords;
 #[command(after_help = "Examples:
   modalcast demo                                the built-in tree in the wind: 60 frames into out/
   modalcast demo --scene path/to/simpleBridge   a model of the FEM library Vega with its internal forces
+  modalcast demo --scene arm.npz                a model of `modalcast model --large`, with arm.cub beside it
   modalcast demo --frames 10 --size 640x360")]
 pub(super) struct Args {
     /// Scene: a built-in name, or a path to a model or a scene folder.
@@ -137,7 +138,7 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     let record_folder = temporary_folder.join("record").to_string_lossy().into_owned();
     let mut flags =
         vec!["--steps", &frame_count, "--dt", &dt, "--delivery", "lossless", "--record", &record_folder, "--json"];
-    let force_flags = input.force_files.flags();
+    let force_flags = input.force_files.demo_flags();
     flags.extend(force_flags.iter().map(String::as_str));
     let physics_process =
         Process::start("physics", &program_path("modalcast-sim")?, &[&flags[..], &common_flags].concat())?;
