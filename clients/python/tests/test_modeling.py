@@ -75,7 +75,6 @@ def test_arguments_become_flags(stand_in: Path, tmp_path: Path):
     command, *flags, separator, source = arguments_of(stand_in)
     assert (command, separator) == ("model", "--")
     assert flags == [
-        "--modes=20",
         "--material=E=1e6,nu=0.3,rho=1000",
         "--clamp=-x < 0.5",
         "--clamp=group base",
@@ -96,6 +95,17 @@ def test_arguments_become_flags(stand_in: Path, tmp_path: Path):
     assert np.isnan(model.frequency_errors[1])
     assert (model.mass, model.size, model.rigid_modes, model.remarks) == (2.5, (1.0, 0.7, 0.4), 6, ("free",))
     mc.SceneBuilder("part", up="z").add(model.positions, model.faces, model.modes, eigenvalues=model.eigenvalues)
+
+
+def test_large_motion_needs_a_file(stand_in: Path, tmp_path: Path):
+    mc.make_model((VERTICES, QUADS), modes=4, large=True, out=tmp_path / "kept.npz", program=stand_in)
+    assert arguments_of(stand_in)[1:3] == ["--modes=4", "--large"]
+    mc.make_model((VERTICES, QUADS), large=False, program=stand_in)
+    assert "--large" not in arguments_of(stand_in)
+    with pytest.raises(
+        ValueError, match=r"^out: expected a file, beside which large=True writes cubic forces, got None$"
+    ):
+        mc.make_model((VERTICES, QUADS), large=True, program=stand_in)
 
 
 def test_progress_line_is_cleared(stand_in: Path, capfd: pytest.CaptureFixture[str]):
@@ -226,6 +236,48 @@ def test_box_has_its_mass_and_frequencies(program: str, client: mc.Client):
         np.abs(model.modes[..., 0]).max(), rel=0.01
     )
     scene.delete()
+
+
+def write_beam(path: Path, cubes: int) -> None:
+    """Writes a beam of cubes along x, each of six tetrahedra, as a file of Gmsh (version 2)."""
+    nodes = [(x / cubes, y / cubes, z / cubes) for x in range(cubes + 1) for y in (0, 1) for z in (0, 1)]
+    # Along the six paths of edges from one corner of a cube to the opposite one.
+    paths = [(1, 3), (1, 5), (2, 3), (2, 6), (4, 5), (4, 6)]
+    corners = [
+        (0, a, b, 7) if is_even else (0, b, a, 7) for (a, b), is_even in zip(paths, [1, 0, 0, 1, 1, 0], strict=True)
+    ]
+    elements = [
+        [4 * x + 1 + _corner(corner) for corner in tetrahedron] for x in range(cubes) for tetrahedron in corners
+    ]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$Nodes", str(len(nodes))]
+    lines += [f"{index} {x} {y} {z}" for index, (x, y, z) in enumerate(nodes, 1)]
+    lines += ["$EndNodes", "$Elements", str(len(elements))]
+    lines += [f"{index} 4 0 {' '.join(map(str, element))}" for index, element in enumerate(elements, 1)]
+    path.write_text("\n".join([*lines, "$EndElements", ""]))
+
+
+def _corner(bits: int) -> int:
+    """The node of a corner of a cube: bit 0 is the step along x, bit 1 along y, bit 2 along z."""
+    return 4 * (bits & 1) + 2 * (bits >> 1 & 1) + (bits >> 2)
+
+
+def test_large_motion_of_a_beam_has_cubic_forces(program: str, tmp_path: Path):
+    write_beam(tmp_path / "beam.msh", 6)
+
+    def make(out: str, *, large: bool) -> mc.ModalModel:
+        source, material = tmp_path / "beam.msh", "E=1e6,nu=0.3,rho=1000"
+        return mc.make_model(
+            source, modes=2, large=large, material=material, clamp="x < 0.01", program=program, out=tmp_path / out
+        )
+
+    model = make("beam.npz", large=True)
+    assert model.modes.shape[2] == 5, "two modes with three derivatives"
+    assert "modes.cubic_sha256" in model.notes
+    coefficients = 5 + 15 + 35
+    assert (tmp_path / "beam.cub").stat().st_size >= 8 * 5 * coefficients
+    linear = make("linear.npz", large=False)
+    assert linear.modes.shape[2] == 2
+    assert not (tmp_path / "linear.cub").exists(), "control"
 
 
 def test_program_rejects_bad_input(program: str, tmp_path: Path):

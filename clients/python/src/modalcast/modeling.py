@@ -27,8 +27,8 @@ ModelingProgress: TypeAlias = Callable[[float, str], object]
 Surface: TypeAlias = str | Path | tuple[ArrayLike, ArrayLike]
 """A file, or vertices (n x 3) and faces (m x 3 or m x 4)."""
 
-OptionValue: TypeAlias = str | float | Sequence[str] | None
-"""The value of an option of the program. Each text of a sequence is a value of its own."""
+OptionValue: TypeAlias = str | float | bool | Sequence[str] | None
+"""The value of an option of the program. Each text of a sequence is a value of its own; True is a flag."""
 
 _STOP_SECONDS = 10.0
 _BAR_WIDTH = 40
@@ -103,8 +103,10 @@ class Computation:
 
         Raises:
             ModelingError: The program does not exist.
-            ValueError: An array has another shape.
+            ValueError: An array has another shape, or cubic forces have no file.
         """
+        if options.get("large") and out is None:
+            raise ValueError("out: expected a file, beside which large=True writes cubic forces, got None")
         try:
             self._program = find_program(program)
         except ServerStartError as error:
@@ -227,6 +229,9 @@ def _flags(options: Mapping[str, OptionValue]) -> list[str]:
     """The flags of the options that are not None. A value can start with '-', so its flag is in the same argument."""
     flags: list[str] = []
     for name, value in options.items():
+        if isinstance(value, bool):
+            flags += [f"--{name}"] if value else []
+            continue
         values = [value] if isinstance(value, (str, int, float, np.generic)) else value or ()
         flags += [f"--{name}={item}" for item in values]
     return flags

@@ -14,7 +14,8 @@ from modalcast.modeling import Computation, ModalModel, ModelingProgress, Surfac
 async def make_model(
     source: Surface,
     *,
-    modes: int | None = 20,
+    modes: int | None = None,
+    large: bool = False,
     material: str | Sequence[str] | None = None,
     clamp: str | Sequence[str] | None = None,
     unit: str | None = None,
@@ -35,7 +36,9 @@ async def make_model(
     Args:
         source: An OBJ, PLY, STL, glTF or npz file; a mesh of tetrahedra (Gmsh .msh, .vtk, .vtu, Vega .veg); the result
             has its surface; or arrays: the vertices, n x 3, and the faces, m x 3 or m x 4.
-        modes: Number of elastic modes; None: that of the program.
+        modes: Number of elastic modes; None: 20, or 5 if `large`.
+        large: For large motion of a volume mesh: adds the derivatives of the modes to U, r = modes (modes + 3) / 2, and
+            writes cubic forces beside `out`, as NAME.cub, with which `modalcast-sim` moves the part.
         material: A name such as "steel", or "E=2.1e11,nu=0.3,rho=7850" in Pa and kg/m^3. With several, "GROUP:MATERIAL"
             is for one group or shell. None: that of the file (.veg), else steel.
         clamp: Regions that do not move, such as "z < 0.01", "group NAME" or "near X Y Z RADIUS", in the unit and the
@@ -56,12 +59,13 @@ async def make_model(
 
     Raises:
         ModelingError: The program is missing, or rejects the surface or an option; the message says why.
-        ValueError: An array has another shape.
+        ValueError: An array has another shape, or `large` is set without `out`.
     """
     computation = Computation(
         source,
         {
             "modes": modes,
+            "large": large,
             "material": material,
             "clamp": clamp,
             "unit": unit,
