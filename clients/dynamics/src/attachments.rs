@@ -114,6 +114,54 @@ impl AttachmentFit {
     }
 }
 
+/// Bounds of the distance between the attachment vertices of a joint and their fitted rigid motion.
+#[derive(Debug, Clone)]
+pub(crate) struct SectionBounds {
+    /// Per mode of the parent.
+    modes: Vec<SectionRate>,
+    /// The largest distance of an attachment vertex from their mean at rest.
+    radius: f64,
+}
+
+/// The motion of the attachment vertices per unit rate of a coordinate.
+#[derive(Debug, Clone, Copy)]
+struct SectionRate {
+    angular_velocity: Vector3<f64>,
+    /// The largest difference of a vertex's velocity from that of the rigid motion.
+    residual: f64,
+}
+
+impl SectionBounds {
+    /// `None` if the parent's modes do not move the joint.
+    pub(crate) fn new(parent: &DomainModel, joint: &Joint) -> Option<Self> {
+        let fit = AttachmentFit::new(parent, joint)?;
+        let samples = || joint.attachment_samples.iter().map(|index| &parent.samples[*index]);
+        let rate = |(mode, rate): (usize, RigidRate)| {
+            let RigidRate { center, center_velocity, angular_velocity } = rate;
+            let difference = |sample: &Sample| {
+                let rigid_velocity = center_velocity + angular_velocity.cross(&(sample.rest_position - center));
+                (sample.column(mode, parent.rank) - rigid_velocity).norm()
+            };
+            SectionRate { angular_velocity, residual: samples().map(difference).fold(0.0, f64::max) }
+        };
+        let modes = fit.rates_at_rest().into_iter().enumerate().map(rate).collect();
+        let distance = |sample: &Sample| (sample.rest_position - fit.rest_mean).norm();
+        Some(Self { modes, radius: samples().map(distance).fold(0.0, f64::max) })
+    }
+
+    /// A bound at the coordinates `q` of the parent, at which the fit has this rotation: the distance of each vertex from
+    /// the linear rigid motion, and the distance of the linear from the finite rotation.
+    pub(crate) fn distance(&self, q: &[f64], rotation: &Matrix3<f64>) -> f64 {
+        let (mut angle, mut residual) = (Vector3::zeros(), 0.0);
+        for (coordinate, mode) in q.iter().zip(&self.modes) {
+            angle += mode.angular_velocity * *coordinate;
+            residual += mode.residual * coordinate.abs();
+        }
+        let nonlinear = (rotation - Matrix3::identity() - angle.cross_matrix()).norm();
+        residual + nonlinear * self.radius
+    }
+}
+
 /// The velocity of a rigid body per unit rate of a coordinate.
 struct RigidRate {
     center: Vector3<f64>,

@@ -2,12 +2,9 @@
 //! its parent, the attachment vertices. The transform T of a child is the product of three transforms: its parent's T,
 //! the rigid transform that best fits the displacement U q of the attachment vertices, and `parent_from_child` at rest.
 
-use nalgebra::Vector3;
-use rayon::prelude::*;
-
 use crate::affine::AffineTransform;
 use crate::attachments::Attachments;
-use crate::model::{DomainModel, MIN_DOMAINS_PER_THREAD, Model};
+use crate::model::Model;
 
 /// Computes `world_from_domain` of every domain at the coordinates `q` of the scene. `local_transforms` has an optional
 /// motion of each domain within its own frame, for example the rotation of a leaf about its stalk. The list may be
@@ -44,60 +41,12 @@ pub fn compose_transforms(
     world_from_domain
 }
 
-/// Measures how far joints open: by how much the distances between a child's base vertex and the attachment vertices of
-/// its parent differ from their values at rest. The base vertex is the child's vertex nearest to the child's origin.
-#[derive(Debug, Clone)]
-pub struct JointGapMeter {
-    /// Distances at rest, per domain and attachment vertex.
-    rest_distances: Vec<Vec<f64>>,
-}
-
-impl JointGapMeter {
-    /// Computes the distances at rest, with the placement of each domain.
-    pub fn new(model: &Model) -> Self {
-        let placements: Vec<_> = model.domains.iter().map(|domain| domain.placement).collect();
-        let q = vec![0.0; model.coordinate_count];
-        Self { rest_distances: joint_distances(model, &q, &placements) }
-    }
-
-    /// The largest opening of a joint, in scene units.
-    pub fn max_gap(&self, model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> f64 {
-        let distances = joint_distances(model, q, world_from_domain);
-        let pairs = distances.iter().flatten().zip(self.rest_distances.iter().flatten());
-        pairs.map(|(distance, rest_distance)| (distance - rest_distance).abs()).fold(0.0, f64::max)
-    }
-}
-
-/// Per domain, the distances between its base vertex and the attachment vertices of its parent. If the parent has no
-/// modes or no attachment vertices, the list has one distance: between the base vertex and its position according to
-/// `parent_from_child`. A domain without a parent has none.
-fn joint_distances(model: &Model, q: &[f64], world_from_domain: &[AffineTransform]) -> Vec<Vec<f64>> {
-    let domain_distances = |(domain, transform): (&DomainModel, &AffineTransform)| {
-        let Some(joint) = &domain.joint else { return vec![] };
-        let (parent, world_from_parent) = (&model.domains[joint.parent], &world_from_domain[joint.parent]);
-        let base_sample = domain.base_sample.map(|index| &domain.samples[index]);
-        let rest_base_position = base_sample.map_or(Vector3::zeros(), |sample| sample.rest_position);
-        let base_position =
-            transform.apply(&base_sample.map_or(rest_base_position, |sample| sample.deformed_position(domain.q(q))));
-        if parent.rank == 0 || joint.attachment_samples.is_empty() {
-            let attached_base_position = world_from_parent.compose(&joint.parent_from_child).apply(&rest_base_position);
-            return vec![(base_position - attached_base_position).norm()];
-        }
-        let distance = |index: &usize| {
-            let sample = &parent.samples[*index];
-            (world_from_parent.apply(&sample.deformed_position(parent.q(q))) - base_position).norm()
-        };
-        joint.attachment_samples.iter().map(distance).collect()
-    };
-    let domains = model.domains.par_iter().with_min_len(MIN_DOMAINS_PER_THREAD);
-    domains.zip(world_from_domain).map(domain_distances).collect()
-}
-
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::model::{Joint, Sample};
-    use nalgebra::Matrix3;
+    use crate::joint_gap::tests::measure_gap;
+    use crate::model::{DomainModel, Joint, Sample};
+    use nalgebra::{Matrix3, Vector3};
     use std::collections::BTreeMap;
 
     /// A beam of length 1 along y with two modes: bending along x and z, with sections that rotate with the slope.
@@ -177,11 +126,10 @@ pub(crate) mod tests {
     #[test]
     fn children_follow_their_parents_and_joints_stay_closed() {
         let model = four_domain_model();
-        let gap_meter = JointGapMeter::new(&model);
         for q in [[0.1, 0.05, -0.08, 0.1, 0.1, -0.1], [-0.12, 0.0, 0.1, 0.1, -0.05, 0.1]] {
             let world_from_domain = compute_transforms(&model, &q, &[]);
             // A small gap remains, because the fitted transform is rigid, but a linear mode stretches rotated sections.
-            let gap = gap_meter.max_gap(&model, &q, &world_from_domain);
+            let gap = measure_gap(&model, &q, &world_from_domain);
             assert!(gap <= 1e-3 * model.diagonal(), "gap {gap}, diagonal {}", model.diagonal());
             for transform in &world_from_domain {
                 assert!((transform.linear.transpose() * transform.linear - Matrix3::identity()).abs().max() <= 1e-9);
@@ -190,17 +138,16 @@ pub(crate) mod tests {
             assert!(displacement > 0.05, "expected a displacement above 0.05, got {displacement}");
             // Negative control: children that do not follow their parents open the joints.
             let placements: Vec<_> = model.domains.iter().map(|domain| domain.placement).collect();
-            assert!(gap_meter.max_gap(&model, &q, &placements) > 1e-2 * model.diagonal());
+            assert!(measure_gap(&model, &q, &placements) > 1e-2 * model.diagonal());
         }
     }
 
     #[test]
     fn rigid_domain_that_rotates_about_its_base_stays_attached() {
         let model = four_domain_model();
-        let gap_meter = JointGapMeter::new(&model);
         let max_gap = |leaf_transform: AffineTransform| {
             let world_from_domain = compute_transforms(&model, &[0.05; 6], &[None, None, None, Some(leaf_transform)]);
-            gap_meter.max_gap(&model, &[0.05; 6], &world_from_domain)
+            measure_gap(&model, &[0.05; 6], &world_from_domain)
         };
         let rotation = AffineTransform::rotation_about(&Vector3::x(), 0.3, &Vector3::zeros());
         assert!(max_gap(rotation) <= 1e-3 * model.diagonal());

@@ -8,7 +8,9 @@
 //! | `affine` | affine transforms, and the rotation nearest to a matrix |
 //! | `connected_parts` | finds the connected parts of a mesh |
 //! | `attachments` | the rigid transforms of joints as functions of q, fitted to displaced vertices |
-//! | `hierarchy` | computes transforms that keep every joint closed, and measures the remaining gap |
+//! | `hierarchy` | computes transforms that keep every joint closed |
+//! | `joint_gap` | measures how far joints open |
+//! | `displacement_meter` | measures the largest displacement over a run |
 //! | `parameters` | reads and validates eigenvalues and damping ratios |
 //! | `rigid_modes` | finds the modes without stiffness, which are held still |
 //! | `oscillator` | integrates one linear mode over a step, exactly |
@@ -78,12 +80,14 @@ mod connected_parts;
 pub mod coupled;
 pub mod cubic;
 pub mod deflection;
+pub mod displacement_meter;
 pub mod divergence;
 mod error;
 pub mod force_domain;
 pub mod hierarchy;
 pub mod implicit;
 pub mod integrator;
+pub mod joint_gap;
 pub mod loads;
 pub mod model;
 mod newton;

@@ -15,9 +15,11 @@ use crate::affine::AffineTransform;
 use crate::attachments::Attachments;
 use crate::checkpoint::RunIdentity;
 use crate::coupled::{CoupledModes, StaticSystem};
+use crate::displacement_meter::DisplacementMeter;
 use crate::error::{Result, check_option, invalid_input};
-use crate::hierarchy::{JointGapMeter, compose_transforms};
+use crate::hierarchy::compose_transforms;
 use crate::integrator::{Integrator, LoadChange, ModalOscillators, MotionState, nyquist_remark};
+use crate::joint_gap::JointGapMeter;
 use crate::loads::DomainLoads;
 use crate::model::{DomainModel, Model};
 use crate::parameters::ModalParameters;
@@ -62,6 +64,7 @@ pub struct TreeScenario {
     next_step: u64,
     crown: Crown,
     attachments: Attachments,
+    displacement_meter: DisplacementMeter,
     gap_meter: JointGapMeter,
     remarks: Vec<String>,
     late_remarks: Vec<String>,
@@ -89,6 +92,8 @@ struct ForcedMotion {
 /// Coordinates and transforms of a step, as the server receives them: rounded to f32.
 struct SentStep {
     q: Vec<f64>,
+    /// Transforms relative to the parents, which are not rounded.
+    attachments: Vec<AffineTransform>,
     world_from_domain: Vec<AffineTransform>,
     drag: f64,
 }
@@ -116,17 +121,6 @@ struct SavedTree {
     motion: ForcedMotion,
     peaks: Peaks,
     late_remarks: Vec<String>,
-}
-
-impl Peaks {
-    const fn max(self, other: Self) -> Self {
-        Self {
-            sway: self.sway.max(other.sway),
-            displacement: self.displacement.max(other.displacement),
-            gap: self.gap.max(other.gap),
-            drag: self.drag.max(other.drag),
-        }
-    }
 }
 
 impl TreeOptions {
@@ -195,6 +189,7 @@ impl TreeScenario {
             next_step: 0,
             crown: Crown::select(&model),
             attachments: Attachments::new(&model),
+            displacement_meter: DisplacementMeter::new(&model),
             gap_meter: JointGapMeter::new(&model),
             remarks: create_remarks(&model, &parameters, &options),
             late_remarks: vec![],
@@ -215,21 +210,17 @@ impl TreeScenario {
         Ok(ForcedMotion { state, forces, viewer_forces, drag: drag.fixed_rows::<3>(0).norm() })
     }
 
-    /// The largest values of a step.
-    fn measure(&self, step: &SentStep) -> Peaks {
-        let SentStep { q, world_from_domain, drag } = step;
-        Peaks {
-            sway: self.crown.sway(&self.model, q, world_from_domain),
-            displacement: self.model.max_displacement(q, world_from_domain),
-            gap: self.gap_meter.max_gap(&self.model, q, world_from_domain),
-            drag: *drag,
-        }
-    }
-
-    /// The largest values of all steps.
+    /// The largest values of all steps. The meters visit only the parts of the last step that may exceed the earlier
+    /// ones.
     fn peaks(&self) -> Peaks {
-        let last_peaks = self.last_step.as_ref().map(|step| self.measure(step));
-        last_peaks.map_or(self.earlier_peaks, |last_peaks| self.earlier_peaks.max(last_peaks))
+        let (model, earlier) = (&self.model, self.earlier_peaks);
+        let Some(SentStep { q, attachments, world_from_domain, drag }) = &self.last_step else { return earlier };
+        Peaks {
+            sway: earlier.sway.max(self.crown.sway(model, q, world_from_domain)),
+            displacement: self.displacement_meter.max_displacement(model, q, world_from_domain, earlier.displacement),
+            gap: self.gap_meter.max_gap(model, q, attachments, world_from_domain, earlier.gap),
+            drag: earlier.drag.max(*drag),
+        }
     }
 }
 
@@ -274,7 +265,7 @@ impl Scenario for TreeScenario {
         let world_from_domain = compose_transforms(&self.model, &attachments, &[]);
         values.transforms = world_from_domain.iter().map(|transform| transform.to_row_major()).collect();
         let world_from_domain = values.transforms.iter().map(AffineTransform::from_row_major).collect();
-        let sent_step = SentStep { q, world_from_domain, drag: self.motion.drag };
+        let sent_step = SentStep { q, attachments, world_from_domain, drag: self.motion.drag };
         (self.earlier_peaks, self.last_step) = (earlier_peaks, Some(sent_step));
         (self.motion, self.next_step) = (next_motion?, self.next_step + 1);
         Ok(())
