@@ -1,6 +1,7 @@
 //! Formats a report as Markdown (`report.md`).
 
 use super::oscillators::{PERIODS, SINGLE_MODES, STIFF_SYSTEM};
+use super::plants::PlantRow;
 use super::recommendation::format_step;
 use super::row::{IntegrationRow, larger};
 use super::solid_modes::SolidRow;
@@ -38,6 +39,7 @@ pub(super) fn markdown(report: &DynamicsReport) -> String {
     }
     text.push_str(&extremes_section(&of_case(extremes::CASE)));
     text.push_str(&solids_section(&report.solids));
+    text.push_str(&plants_section(&report.plants));
     text.push_str(&recommendation_section(report));
     text
 }
@@ -288,6 +290,39 @@ fn solids_section(rows: &[SolidRow]) -> String {
     format!(
         "\n## Modes of solids\n\nFree solids, rotated against the grid. The references are Rayleigh-Ritz solutions with \
          polynomials. The memory is that of the whole process.\n\n{}",
+        table(&head, rows.iter().map(line))
+    )
+}
+
+fn plants_section(rows: &[PlantRow]) -> String {
+    let Some(smallest) = rows.first() else { return String::new() };
+    let head = [
+        "plant",
+        "domains",
+        "coordinates",
+        "µs per step",
+        "CPU µs per step",
+        "CPU µs per step and domain",
+        "relative",
+        "steps/s",
+        "load average",
+    ];
+    let line = |row: &PlantRow| {
+        [
+            row.plant.clone(),
+            row.domains.to_string(),
+            row.coordinates.to_string(),
+            format!("{:.0}", row.step_us),
+            format!("{:.0}", row.step_cpu_us),
+            format_decimal(Some(row.domain_cpu_us())),
+            format_decimal(Some(row.domain_cpu_us() / smallest.domain_cpu_us())),
+            format!("{:.0}", 1e6 / row.step_us),
+            format_decimal(row.load_average),
+        ]
+    };
+    format!(
+        "\n## Plants\n\nA step of the physics process in the wind, without a server: wind, motion, transforms, and the \
+         largest values of the run. CPU times are those of all threads together.\n\n{}",
         table(&head, rows.iter().map(line))
     )
 }

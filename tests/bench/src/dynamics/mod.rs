@@ -5,7 +5,8 @@
 //!   modes that are left out;
 //! - `cubic`: systems with cubic forces against a Runge-Kutta reference;
 //! - `extremes`: extreme steps, eigenvalues and loads;
-//! - `solid_modes`: frequencies by `modalcast model` against exact ones.
+//! - `solid_modes`: frequencies by `modalcast model` against exact ones;
+//! - `plants`: the time of a step of plants whose domains act on each other.
 //!
 //! Observed orders are compared with the theory, and a negative control must have a large error. `recommendation`
 //! selects the fastest setting within each limit of the error.
@@ -18,6 +19,8 @@ mod markdown;
 mod method;
 mod oscillators;
 mod output;
+mod plant_files;
+mod plants;
 mod plot;
 mod recommendation;
 mod reference;
@@ -31,6 +34,7 @@ use std::path::PathBuf;
 use serde::Serialize;
 
 use self::cubic::CubicResult;
+pub use self::plants::PlantRow;
 pub use self::recommendation::DynamicsRecommendation;
 pub use self::reference::ReferenceSummary;
 pub use self::row::{Expectation, IntegrationRow, MotionErrors};
@@ -44,7 +48,7 @@ use modalcast_model::error::Result;
 /// Settings of a report.
 #[derive(Debug, Clone)]
 pub struct DynamicsReportOptions {
-    /// Folder with `vega/simpleBridge`. Without it, only generated systems are measured.
+    /// Folder with `vega/simpleBridge` and `plants/almond`. Without it, only generated systems are measured.
     pub scenes: Option<PathBuf>,
     pub size: Size,
 }
@@ -61,6 +65,7 @@ pub struct DynamicsReport {
     pub rows: Vec<IntegrationRow>,
     pub references: Vec<ReferenceSummary>,
     pub solids: Vec<SolidRow>,
+    pub plants: Vec<PlantRow>,
     pub recommendations: Vec<DynamicsRecommendation>,
     /// Expectations that are not met, each as `case: system: reason`.
     pub failed: Vec<String>,
@@ -76,7 +81,7 @@ pub enum DynamicsProgress<'a> {
 }
 
 /// The cases in the order of the report.
-const CASES: [&str; 7] = [
+const CASES: [&str; 8] = [
     oscillators::SINGLE_MODES,
     oscillators::STIFF_SYSTEM,
     beam::CASE,
@@ -84,6 +89,7 @@ const CASES: [&str; 7] = [
     cubic::BRIDGE,
     extremes::CASE,
     solid_modes::CASE,
+    plants::CASE,
 ];
 
 /// Measures all cases. `progress` is called before and after each case.
@@ -116,6 +122,7 @@ impl DynamicsReport {
             rows: Vec::new(),
             references: Vec::new(),
             solids: Vec::new(),
+            plants: Vec::new(),
             recommendations: Vec::new(),
             failed: Vec::new(),
         }
@@ -147,7 +154,8 @@ impl DynamicsReport {
                 self.rows.extend(rows);
                 self.references.extend(references);
             }
-            _ => self.solids = solid_modes::measure(size),
+            solid_modes::CASE => self.solids = solid_modes::measure(size),
+            _ => self.plants = plants::measure(options.scenes.as_deref(), size)?,
         }
         Ok(())
     }

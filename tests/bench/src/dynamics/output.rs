@@ -58,9 +58,20 @@ pub(super) const SOLID_COLUMNS: [(&str, &str); 10] = [
     ("failure", "/failure"),
 ];
 
+/// Columns of `plants.csv`.
+pub(super) const PLANT_COLUMNS: [(&str, &str); 7] = [
+    ("plant", "/plant"),
+    ("domains", "/domains"),
+    ("coordinates", "/coordinates"),
+    ("steps", "/steps"),
+    ("step_us", "/step_us"),
+    ("step_cpu_us", "/step_cpu_us"),
+    ("load_average", "/load_average"),
+];
+
 impl DynamicsReport {
-    /// Writes `report.json`, `report.csv` (integrators), `solids.csv`, `report.md`, `report.svg` and `report.png` into a
-    /// folder, which is created.
+    /// Writes `report.json`, `report.csv` (integrators), `solids.csv`, `plants.csv`, `report.md`, `report.svg` and
+    /// `report.png` into a folder, which is created.
     ///
     /// # Errors
     /// `Fault` when a file cannot be written.
@@ -70,6 +81,7 @@ impl DynamicsReport {
             ("report.json", serde_json::to_vec_pretty(self).map_err(fault_in("report"))?),
             ("report.csv", csv(&COLUMNS, &self.rows)?),
             ("solids.csv", csv(&SOLID_COLUMNS, &self.solids)?),
+            ("plants.csv", csv(&PLANT_COLUMNS, &self.plants)?),
             ("report.md", markdown::markdown(self).into_bytes()),
             ("report.png", render_png(&svg)?),
             ("report.svg", svg.into_bytes()),

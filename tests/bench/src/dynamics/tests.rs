@@ -344,6 +344,7 @@ fn files_are_complete_and_parse() {
     report.rows.push(measured_row(cubic::CHAIN, AVERAGE_VECTOR_FIELD, 60.0, 1e-3, 10.0));
     report.rows.extend([10.0, 20.0].map(|per_second| measured_row(beam::CASE, Method::Exact, per_second, 1e-3, 2.0)));
     report.solids = vec![solid_row("box", 3_000, 1e-3, 1.0)];
+    report.plants = vec![plant_row(100, 200.0), plant_row(1_000, 3_000.0)];
     report.recommendations = recommend(&report.rows, &report.solids);
     report.failed = vec!["a case: a reason".into()];
     let folder = tempfile::tempdir().expect("a folder");
@@ -352,15 +353,18 @@ fn files_are_complete_and_parse() {
     let json: serde_json::Value = serde_json::from_slice(&read("report.json")).expect("JSON");
     assert_eq!(json["rows"].as_array().map(Vec::len), Some(5));
     assert!(json["rows"][1]["observed_order"].as_f64().is_some_and(|order| (order - 2.0).abs() < 0.1), "{json}");
-    for (name, count) in [("report.csv", 5), ("solids.csv", 1)] {
+    for (name, count) in [("report.csv", 5), ("solids.csv", 1), ("plants.csv", 2)] {
         let bytes = read(name);
         let mut reader = csv::Reader::from_reader(bytes.as_slice());
         assert_eq!(reader.records().filter(Result::is_ok).count(), count, "{name}");
     }
     let markdown = String::from_utf8(read("report.md")).expect("UTF-8");
-    for text in
-        ["- a case: a reason", "| chain with cubic forces | 1e-3 | AVF, steps of 1/60 s |", "Not measured yet: "]
-    {
+    for text in [
+        "- a case: a reason",
+        "| chain with cubic forces | 1e-3 | AVF, steps of 1/60 s |",
+        "Not measured yet: ",
+        PLANT_LINE,
+    ] {
         assert!(markdown.contains(text), "expected {text} in {markdown}");
     }
     let svg = String::from_utf8(read("report.svg")).expect("UTF-8");
@@ -380,6 +384,33 @@ fn every_column_has_a_value() {
     for (name, pointer) in output::SOLID_COLUMNS {
         assert!(value.pointer(pointer).is_some(), "{name}");
     }
+    let value = serde_json::to_value(plant_row(100, 1.0)).expect("JSON");
+    for (name, pointer) in output::PLANT_COLUMNS {
+        assert!(value.pointer(pointer).is_some(), "{name}");
+    }
+}
+
+/// A plant whose step takes the given time of all threads.
+fn plant_row(domains: usize, step_cpu_us: f64) -> PlantRow {
+    let plant = format!("generated, {domains} domains");
+    let (coordinates, steps) = (4 * domains, 100);
+    PlantRow { plant, domains, coordinates, steps, step_us: 0.5 * step_cpu_us, step_cpu_us, load_average: Some(0.5) }
+}
+
+/// The line of the second plant of the tables.
+const PLANT_LINE: &str = "| generated, 1000 domains | 1000 | 4000 | 1500 | 3000 | 3.00 | 1.50 | 667 | 0.50 |";
+
+/// All domains of a generated plant act on each other and move in the wind.
+#[test]
+fn generated_plants_have_modes_and_sway() {
+    let model = plants::generated_plant(40).expect("a plant");
+    assert_eq!(model.domains.len(), 40);
+    let ranks: Vec<usize> = model.domains.iter().map(|domain| domain.rank).collect();
+    assert_eq!((ranks[0], ranks.iter().filter(|rank| **rank == 3).count()), (12, 36), "{ranks:?}");
+    assert_eq!(model.domains.iter().filter(|domain| domain.joint.is_none()).count(), 1);
+    assert!(model.domains.iter().all(|domain| domain.inertia.is_some()));
+    let row = plants::measure_plant("small", model).expect("a measurement");
+    assert!(row.domains == 40 && row.step_us > 0.0 && row.step_cpu_us > 0.0, "{row:?}");
 }
 
 #[test]
