@@ -32,6 +32,7 @@ mod normals;
 mod picks;
 mod pictures;
 mod pixels;
+mod plants;
 mod raster;
 mod real;
 mod restart;

@@ -25,7 +25,7 @@ const DISPLACEMENT: f64 = 0.0501;
 /// Required displacement of the test states, relative to the scene's diagonal. 5 % make errors of U q visible.
 const MIN_DISPLACEMENT: f64 = 0.05;
 
-fn input_path(path: &str) -> String {
+pub(crate) fn input_path(path: &str) -> String {
     let root = std::env::var_os("MODALCAST_DATA").map_or_else(|| PathBuf::from("../shared/data"), PathBuf::from);
     root.join(path).to_string_lossy().into_owned()
 }
