@@ -7,8 +7,8 @@ use nalgebra::{Matrix3, Vector3, Vector6};
 use rayon::prelude::*;
 
 use crate::affine::{AffineTransform, MIN_RELATIVE_SPREAD, nearest_rotation};
-use crate::loads::stack;
 use crate::model::{DomainModel, Joint, MIN_DOMAINS_PER_THREAD, Model, Sample};
+use crate::wrench::stack;
 
 /// The attachments of all domains of a model.
 pub struct Attachments {

@@ -17,6 +17,7 @@ Examples:
   modalcast-sim fork --slow 100 --forces --seconds 0 --realtime
   modalcast-sim sweep --open MorphStressTest --scene morph --record out/record
   modalcast-sim tree --wind 12 --seconds 60 --realtime
+  modalcast-sim part --free --forces --seconds 0 --realtime
   modalcast-sim static tree --force trunk:100:0,0,50 --json
   modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint
   modalcast-sim tree --seconds 3600 --checkpoint tree.checkpoint --resume tree.checkpoint
@@ -84,6 +85,11 @@ pub(crate) const SWEEP_SHARE: f64 = 0.06;
 pub(crate) struct PhysicsOptions {
     #[command(flatten)]
     pub(crate) wind: WindOptions,
+    /// Let every domain without a parent move and turn freely, with all that it carries: by the forces of viewers
+    /// (--forces) and, with --wind, by the wind relative to it. Needs the mass properties of the domains. Linear modes; there is no gravity and no contact. A body that is more than 5
+    /// diagonals of the scene away returns to rest.
+    #[arg(long, conflicts_with_all = ["cubic", "deflection_fraction"])]
+    pub(crate) free: bool,
     #[command(flatten)]
     pub(crate) files: ForceFileOptions,
     #[command(flatten)]

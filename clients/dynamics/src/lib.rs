@@ -16,6 +16,8 @@
 //! | `oscillator` | integrates one linear mode over a step, exactly |
 //! | `loads` | forces on the coordinates of domains, and wrenches on their frames |
 //! | `coupled` | domains that act on each other at joints: equations of motion, integrator, static response |
+//! | `free_bodies` | bodies that nothing holds, under the forces of viewers and of the wind |
+//! | `drag` | the drag of the wind on moving bodies |
 //! | `deflection` | displacements of a scene at rest under forces at vertices |
 //! | `wind` | wind pressure by time and position, from a spectrum of turbulence |
 //! | `tree` | linear modes in the wind and under forces of viewers: a tree, or a single body |
@@ -82,8 +84,10 @@ pub mod cubic;
 pub mod deflection;
 pub mod displacement_meter;
 pub mod divergence;
+mod drag;
 mod error;
 pub mod force_domain;
+pub mod free_bodies;
 pub mod hierarchy;
 pub mod implicit;
 pub mod integrator;
@@ -110,5 +114,6 @@ pub mod vega;
 pub mod viewer_forces;
 mod viewer_response;
 pub mod wind;
+mod wrench;
 
 pub use error::{Error, Result, invalid_input};

@@ -3,6 +3,7 @@
 use nalgebra::{Vector3, Vector6};
 
 use crate::model::{DomainModel, Model, Sample};
+use crate::wrench::stack;
 
 /// Forces on all domains of a scene.
 #[derive(Debug, Clone, PartialEq)]
@@ -12,12 +13,28 @@ pub struct DomainLoads {
     /// Per domain: the sum of the forces on its material in newtons, then the sum of their moments about the domain's
     /// origin at rest in newtons times scene units; in world axes. They act on the ancestors of the domain.
     pub wrenches: Vec<Vector6<f64>>,
+    /// The forces that [`Self::add_wrench`] has added to `wrenches`, for bodies that turn.
+    pub points: Vec<PointForce>,
+}
+
+/// A force at a point of a domain.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointForce {
+    pub domain: usize,
+    /// At rest, in the frame of the domain.
+    pub rest_point: Vector3<f64>,
+    /// In newtons and world axes.
+    pub force: Vector3<f64>,
 }
 
 impl DomainLoads {
     /// No forces.
     pub fn none(model: &Model) -> Self {
-        Self { coordinates: vec![0.0; model.coordinate_count], wrenches: vec![Vector6::zeros(); model.domains.len()] }
+        Self {
+            coordinates: vec![0.0; model.coordinate_count],
+            wrenches: vec![Vector6::zeros(); model.domains.len()],
+            points: vec![],
+        }
     }
 
     /// Forces on the coordinates alone.
@@ -30,6 +47,7 @@ impl DomainLoads {
     pub fn add_wrench(&mut self, model: &Model, domain: usize, rest_point: &Vector3<f64>, force: &Vector3<f64>) {
         let arm = model.domains[domain].placement.linear * rest_point;
         self.wrenches[domain] += stack(force, &arm.cross(force));
+        self.points.push(PointForce { domain, rest_point: *rest_point, force: *force });
     }
 
     /// Adds a force in newtons and world axes at a sample of a domain.
@@ -41,14 +59,4 @@ impl DomainLoads {
         }
         self.add_wrench(model, domain, &sample.rest_position, force);
     }
-}
-
-/// Stacks two vectors.
-pub(crate) fn stack(upper: &Vector3<f64>, lower: &Vector3<f64>) -> Vector6<f64> {
-    Vector6::new(upper.x, upper.y, upper.z, lower.x, lower.y, lower.z)
-}
-
-/// Splits a vector of six numbers into two.
-pub(crate) fn split(vector: &Vector6<f64>) -> (Vector3<f64>, Vector3<f64>) {
-    (vector.fixed_rows::<3>(0).into_owned(), vector.fixed_rows::<3>(3).into_owned())
 }

@@ -14,6 +14,7 @@ use modalcast_dynamics::checkpoint::CheckpointOptions;
 use modalcast_dynamics::cubic::ReducedForce;
 use modalcast_dynamics::deflection::report_deflections;
 use modalcast_dynamics::force_domain::{check_forces_belong, find_force_domain};
+use modalcast_dynamics::free_bodies::{FreeOptions, FreeScenario};
 use modalcast_dynamics::model::Model;
 use modalcast_dynamics::parameters::ModalParameters;
 use modalcast_dynamics::reduced_system::ReducedSystem;
@@ -147,6 +148,10 @@ async fn create_scenario(client: &Client, scene: &str, arguments: &Cli) -> Resul
     // A model with few samples is enough to select the physics.
     let model = Model::fetch(client, scene, MAX_TREE_SAMPLES).await?;
     let announce = |motion: &str| eprintln!("modalcast-sim: {scene}: {motion}");
+    if arguments.physics.free {
+        announce("free bodies");
+        return create_free_scenario(model, arguments);
+    }
     if let Some(force_path) = find_force_file(&model, files)? {
         return create_bridge_scenario(client, scene, arguments, &force_path).await;
     }
@@ -184,6 +189,18 @@ fn create_tree_scenario(model: Model, arguments: &Cli, wind_speed: f64) -> Resul
         seed: wind.seed,
     };
     Ok(TimedScenario { scenario: Box::new(TreeScenario::new(model, options)?), timing })
+}
+
+fn create_free_scenario(model: Model, arguments: &Cli) -> Result<TimedScenario> {
+    let timing = choose_timing(&model.scene, arguments, ModalParameters::read(&model)?.lowest_frequency());
+    let wind = &arguments.physics.wind;
+    let options = FreeOptions {
+        dt: timing.dt,
+        wind_speed: wind.speed.unwrap_or(0.0),
+        direction_radians: wind.direction_degrees.to_radians(),
+        seed: wind.seed,
+    };
+    Ok(TimedScenario { scenario: Box::new(FreeScenario::new(model, options)?), timing })
 }
 
 /// The times of a run. Says by which factor `--slow auto` slows the motion down.

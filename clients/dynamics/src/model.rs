@@ -6,12 +6,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use modalcast_client::{Client, Domain, Inertia, ModeRows, SceneDescription, Shape, ShapeArray};
-use nalgebra::{DMatrix, Matrix3, Matrix6, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
 use crate::affine::AffineTransform;
 use crate::connected_parts::ConnectedParts;
 use crate::error::{Result, invalid_input};
+use crate::wrench::{split, stack};
 
 /// Maximum number of entries of U in the surface samples of all domains together: 64 MiB of f64.
 const MAX_MODE_ENTRIES: usize = 8 << 20;
@@ -178,6 +179,20 @@ impl DomainModel {
     pub fn carrier(&self) -> Option<usize> {
         let followed = self.follow.as_ref().map(|follow| follow.leader);
         followed.or_else(|| self.joint.as_ref().map(|joint| joint.parent))
+    }
+
+    /// The kinetic energy of a motion of the frame in world axes at rest (translation of the origin, then rotation
+    /// vector) and of the coordinates, per second. Without mass properties, that of modes of unit mass.
+    pub fn kinetic_energy(&self, frame: &Vector6<f64>, velocities: &[f64]) -> f64 {
+        let v = DVector::from_column_slice(velocities);
+        let Some(inertia) = &self.inertia else {
+            return if self.owns_q { 0.5 * v.norm_squared() } else { 0.0 };
+        };
+        let local_from_world = self.placement.linear.transpose();
+        let (translation, rotation) = split(frame);
+        let frame = stack(&(local_from_world * translation), &(local_from_world * rotation));
+        let momentum: Vector6<f64> = inertia.coupling.iter().zip(&v).map(|(column, v)| column * *v).sum();
+        0.5 * frame.dot(&(inertia.rigid * frame)) + frame.dot(&momentum) + 0.5 * v.dot(&(&inertia.modal * &v))
     }
 
     /// The samples that are spread evenly over the vertices.

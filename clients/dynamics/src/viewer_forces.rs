@@ -139,7 +139,7 @@ mod tests {
         let pull = AppliedForce { surface, rest_point: Some([0.0, 0.5, 0.0]), ..force(3, &[]) };
         let loads = sum_forces(&model, &[pull.clone(), pull]).expect("valid forces");
         let arm = model.domains[3].placement.linear * Vector3::new(0.0, 0.5, 0.0);
-        let (force, moment) = crate::loads::split(&loads.wrenches[3]);
+        let (force, moment) = crate::wrench::split(&loads.wrenches[3]);
         assert_eq!(force, 2.0 * Vector3::from(vector));
         assert!((moment - 2.0 * arm.cross(&Vector3::from(vector))).norm() <= 1e-12, "{moment}");
         assert_eq!(loads.wrenches[..3], [Vector6::zeros(); 3]);

@@ -27,7 +27,7 @@ use crate::model::MIN_DOMAINS_PER_THREAD;
 use crate::saved_state::number_bits;
 
 /// rho, the density of air at 15 degrees Celsius and sea level (ICAO standard atmosphere), in kg/m^3.
-const AIR_DENSITY: f64 = 1.225;
+pub(crate) const AIR_DENSITY: f64 = 1.225;
 
 /// L, in meters.
 const LENGTH_SCALE: f64 = 40.0;
@@ -78,6 +78,13 @@ pub struct WindPressure {
     pub downwind: f64,
     #[serde(with = "number_bits")]
     pub crosswind: f64,
+}
+
+/// Velocity of the air in m/s along the two horizontal directions of a wind.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct WindVelocity {
+    pub(crate) downwind: f64,
+    pub(crate) crosswind: f64,
 }
 
 /// Speeds of a gust, relative to the mean speed.
@@ -174,6 +181,17 @@ impl Wind {
             }
         };
         self.gust_speeds(time).map(pressure).collect()
+    }
+
+    /// The velocity of the wind at every domain `time` seconds after its start, of which [`Self::pressures`] are the
+    /// pressures on bodies at rest.
+    pub(crate) fn velocities(&self, time: f64) -> Vec<WindVelocity> {
+        let mean_speed = (2.0 * self.mean_pressure / AIR_DENSITY * smoothstep(time / RISE_TIME)).sqrt();
+        let velocity = |gust: GustSpeed| WindVelocity {
+            downwind: mean_speed * (1.0 + gust.downwind),
+            crosswind: mean_speed * gust.crosswind,
+        };
+        self.gust_speeds(time).map(velocity).collect()
     }
 
     /// The gust speed at every domain.

@@ -10,10 +10,12 @@ use std::ops::Range;
 
 use nalgebra::{Matrix6, Vector3, Vector6};
 
+use super::transport_matrix;
 use crate::attachments::joint_modes;
 use crate::error::{Result, invalid_input};
-use crate::loads::{DomainLoads, split, stack};
+use crate::loads::DomainLoads;
 use crate::model::{DomainModel, Model, Sample};
+use crate::wrench::{split, stack};
 
 /// The motion of a frame: G X + H q with the motion X and the coordinates q of a body.
 #[derive(Debug, Clone, PartialEq)]
@@ -52,10 +54,22 @@ pub struct JointTree {
     pub(super) frames: Vec<FrameMotion>,
 }
 
+/// Forces on the coordinates of a scene, and wrenches on the frames of its roots.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ReducedLoad {
+    pub(super) coordinates: Vec<f64>,
+    pub(super) roots: Vec<Vector6<f64>>,
+}
+
 impl FrameMotion {
     /// The frame of the body itself.
     const fn of_body(body: usize) -> Self {
         Self { body, offset: Some(Vector3::new(0.0, 0.0, 0.0)), modes: vec![] }
+    }
+
+    /// Whether the frame moves with that of its body.
+    pub(super) const fn moves_with_body(&self) -> bool {
+        self.offset.is_some()
     }
 
     /// The motion G X.
@@ -84,10 +98,7 @@ impl FrameMotion {
 
     /// G.
     pub(super) fn matrix(&self) -> Matrix6<f64> {
-        let Some(offset) = self.offset else { return Matrix6::zeros() };
-        let mut matrix = Matrix6::identity();
-        matrix.fixed_view_mut::<3, 3>(0, 3).copy_from(&-offset.cross_matrix());
-        matrix
+        self.offset.map_or_else(Matrix6::zeros, |offset| transport_matrix(&offset))
     }
 
     /// The motion of a frame at `offset` from this one, which the modes `modes` move in addition.
@@ -183,23 +194,56 @@ impl JointTree {
     /// The forces on the coordinates that have the same effect as `loads`: the loads do the same work, because all
     /// frames move as functions of the coordinates.
     pub fn reduce(&self, loads: &DomainLoads) -> Vec<f64> {
+        self.reduce_to_roots(loads).coordinates
+    }
+
+    /// As [`Self::reduce`], with the wrenches on the frames of the roots.
+    pub(super) fn reduce_to_roots(&self, loads: &DomainLoads) -> ReducedLoad {
         let mut forces = loads.coordinates.clone();
         let mut wrenches = vec![Vector6::zeros(); self.bodies.len()];
-        let mut add = |frame: &FrameMotion, wrench: &Vector6<f64>, wrenches: &mut [Vector6<f64>]| {
-            let Body { first_coordinate, rank, .. } = self.bodies[frame.body];
-            frame.add_modal_forces(wrench, &mut forces[first_coordinate..][..rank]);
-            wrenches[frame.body] += frame.transport_back(wrench);
-        };
         for (frame, wrench) in self.frames.iter().zip(&loads.wrenches) {
-            add(frame, wrench, &mut wrenches);
+            self.add_wrench(frame, wrench, &mut forces, &mut wrenches);
         }
+        self.sweep_to_roots(forces, wrenches)
+    }
+
+    /// Moves the wrenches on all bodies to the coordinates of their ancestors and to the roots.
+    pub(super) fn sweep_to_roots(&self, mut forces: Vec<f64>, mut wrenches: Vec<Vector6<f64>>) -> ReducedLoad {
         for (index, body) in self.bodies.iter().enumerate().rev() {
             if let Some(joint) = &body.joint {
                 let wrench = wrenches[index];
-                add(joint, &wrench, &mut wrenches);
+                self.add_wrench(joint, &wrench, &mut forces, &mut wrenches);
             }
         }
-        forces
+        wrenches.truncate(self.root_count());
+        ReducedLoad { coordinates: forces, roots: wrenches }
+    }
+
+    /// Adds a wrench on a frame to its body.
+    fn add_wrench(
+        &self,
+        frame: &FrameMotion,
+        wrench: &Vector6<f64>,
+        forces: &mut [f64],
+        wrenches: &mut [Vector6<f64>],
+    ) {
+        let Body { first_coordinate, rank, .. } = self.bodies[frame.body];
+        frame.add_modal_forces(wrench, &mut forces[first_coordinate..][..rank]);
+        wrenches[frame.body] += frame.transport_back(wrench);
+    }
+
+    /// The number of bodies without a joint, which are the first ones.
+    pub(super) fn root_count(&self) -> usize {
+        self.levels.first().map_or(0, Range::len)
+    }
+
+    /// Per body: the index of its root.
+    pub(super) fn roots(&self) -> Vec<usize> {
+        let mut roots: Vec<usize> = vec![];
+        for (index, body) in self.bodies.iter().enumerate() {
+            roots.push(body.joint.as_ref().map_or(index, |joint| roots[joint.body]));
+        }
+        roots
     }
 
     /// Per coordinate: a bound of the displacement of the vertices of all descendants of its domain per unit of the
@@ -232,7 +276,13 @@ impl JointTree {
 
     /// Per domain: the motion of its frame at the coordinates `q` of the scene.
     pub fn frame_motions(&self, q: &[f64]) -> Vec<Vector6<f64>> {
-        let mut motions = vec![Vector6::zeros(); self.bodies.len()];
+        self.frame_motions_from(&vec![Vector6::zeros(); self.root_count()], q)
+    }
+
+    /// As [`Self::frame_motions`], with small motions of the roots.
+    pub(super) fn frame_motions_from(&self, roots: &[Vector6<f64>], q: &[f64]) -> Vec<Vector6<f64>> {
+        let mut motions = roots.to_vec();
+        motions.resize(self.bodies.len(), Vector6::zeros());
         let q_of = |body: usize| &q[self.bodies[body].first_coordinate..][..self.bodies[body].rank];
         for (index, body) in self.bodies.iter().enumerate() {
             if let Some(joint) = &body.joint {

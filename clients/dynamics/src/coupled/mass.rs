@@ -80,6 +80,16 @@ impl Block {
         })
     }
 
+    /// R^T M R.
+    pub(super) const fn rigid(&self) -> &Matrix6<f64> {
+        &self.rigid
+    }
+
+    /// U^T M R X: the momenta of the coordinates of the body while its frame moves by X.
+    pub(super) fn modal_momenta(&self, motion: &Vector6<f64>) -> impl Iterator<Item = f64> {
+        self.coupling.iter().map(|coupling| coupling.dot(motion))
+    }
+
     /// Adds the block of a frame that moves by G X + H q: the terms of the same kinetic energy. `other.coupling` and
     /// `other.modal` are in the coordinates of this body.
     fn add(&mut self, frame: &FrameMotion, other: &Self) {
@@ -191,11 +201,15 @@ impl Factor {
 }
 
 /// Factors the matrix of a step. `diagonal` has dt/2 C + dt^2/4 K per coordinate of the scene. Returns the factors of
-/// all bodies.
+/// all bodies, and the Schur complements of the roots.
 ///
 /// # Errors
 /// `Invalid` if the mass properties of a domain do not fit to its modes or its placement, or are not positive definite.
-pub(super) fn factor_bodies(model: &Model, tree: &JointTree, diagonal: &[Diagonal]) -> Result<Vec<Factor>> {
+pub(super) fn factor_bodies(
+    model: &Model,
+    tree: &JointTree,
+    diagonal: &[Diagonal],
+) -> Result<(Vec<Factor>, Vec<Matrix6<f64>>)> {
     let mut blocks = assemble_blocks(model, tree)?;
     let mut factors: Vec<Factor> = vec![];
     // The Schur complements of the bodies from `level.end` on.
@@ -221,7 +235,8 @@ pub(super) fn factor_bodies(model: &Model, tree: &JointTree, diagonal: &[Diagona
         }
     }
     factors.reverse();
-    Ok(factors)
+    complements.truncate(tree.levels.first().map_or(0, std::ops::Range::len));
+    Ok((factors, complements))
 }
 
 /// The blocks of all bodies without their children: M.

@@ -15,9 +15,14 @@
 //!
 //! It conserves the energy of a free motion without damping at any dt. `mass` factors the matrix once. A step then
 //! has one sweep from the leaves to the roots and one back, so its time is proportional to the number of domains.
+//!
+//! `free` lets the frames of the roots move as well, by any angle.
 
 #[cfg(test)]
 mod beam_tests;
+mod free;
+#[cfg(test)]
+mod free_tests;
 mod joints;
 mod mass;
 mod statics;
@@ -28,13 +33,14 @@ mod tests;
 
 use std::ops::Range;
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
 use crate::error::{Result, invalid_input};
 use crate::integrator::{Integrator, LoadChange, MotionState, StepReport};
 use crate::model::{MIN_DOMAINS_PER_THREAD, Model};
 use crate::parameters::{ModalParameters, ModeParameters};
+pub use free::{FreeLoad, FreeModes, FreeState, RigidState};
 use joints::Body;
 pub use joints::JointTree;
 use mass::{Diagonal, Factor, factor_bodies};
@@ -45,6 +51,8 @@ pub struct CoupledModes {
     tree: JointTree,
     /// Per body.
     factors: Vec<Factor>,
+    /// Per root: the inertia of its frame in a step, with that of everything it carries.
+    root_inertias: Vec<Matrix6<f64>>,
     /// Per coordinate; `None` for a mode that is held still.
     modes: Vec<Option<ModeTerms>>,
     dt: f64,
@@ -86,8 +94,8 @@ impl CoupledModes {
         let modes: Vec<Option<ModeTerms>> = parameters.modes.iter().map(|mode| mode.as_ref().map(terms)).collect();
         let diagonal_term = |mode: &ModeTerms| 0.5 * dt * mode.damping + 0.25 * dt * dt * mode.stiffness;
         let diagonal: Vec<Diagonal> = modes.iter().map(|mode| mode.as_ref().map(diagonal_term)).collect();
-        let factors = factor_bodies(model, &tree, &diagonal)?;
-        Ok(Self { tree, factors, modes, dt })
+        let (factors, root_inertias) = factor_bodies(model, &tree, &diagonal)?;
+        Ok(Self { tree, factors, root_inertias, modes, dt })
     }
 
     /// The joints of the scene.
@@ -95,8 +103,42 @@ impl CoupledModes {
         &self.tree
     }
 
+    /// The indices of all coordinates: in the order of bodies, and in the scene.
+    fn coordinates(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        let bodies = self.tree.bodies.iter();
+        bodies.flat_map(|body| (0..body.rank).map(|mode| (body.offset + mode, body.first_coordinate + mode)))
+    }
+
+    /// The right side of the equations of a step, in the order of bodies. `force` is the mean force on a coordinate.
+    fn right_side(&self, state: &MotionState, force: impl Fn(usize) -> f64) -> Vec<f64> {
+        let mut forces = vec![0.0; state.q.len()];
+        for (position, index) in self.coordinates() {
+            let Some(ModeTerms { stiffness, damping }) = self.modes[index] else { continue };
+            let (q, v) = (state.q[index], state.v[index]);
+            forces[position] = force(index) - damping * v - stiffness * (q + 0.5 * self.dt * v);
+        }
+        forces
+    }
+
+    /// Adds a step of the accelerations, in the order of bodies, to a state.
+    fn add_step(&self, state: &mut MotionState, accelerations: &[f64]) {
+        for (position, index) in self.coordinates() {
+            let velocity_change = self.dt * accelerations[position];
+            state.q[index] += self.dt * (state.v[index] + 0.5 * velocity_change);
+            state.v[index] += velocity_change;
+        }
+    }
+
     /// Solves the equations of a step: replaces the forces on all coordinates, in the order of bodies, by accelerations.
-    fn solve(&self, coordinates: &mut [f64]) {
+    /// `solve_roots` replaces the wrenches on the frames of the roots by accelerations.
+    ///
+    /// # Errors
+    /// Those of `solve_roots`.
+    fn solve(
+        &self,
+        coordinates: &mut [f64],
+        solve_roots: impl FnOnce(&mut [Vector6<f64>]) -> Result<()>,
+    ) -> Result<()> {
         let bodies = &self.tree.bodies;
         let end_of = |level: &Range<usize>| bodies[level.end - 1].offset + bodies[level.end - 1].rank;
         // Per body: the wrench that it passes to its parent.
@@ -109,6 +151,8 @@ impl CoupledModes {
         }
         // Per body: the acceleration of its frame.
         let mut accelerations = wrenches;
+        let root_count = self.tree.levels.first().map_or(0, Range::len);
+        solve_roots(&mut accelerations[..root_count])?;
         for level in &self.tree.levels {
             let (parent_accelerations, level_accelerations) = accelerations.split_at_mut(level.start);
             let (parent_coordinates, level_coordinates) = coordinates.split_at_mut(bodies[level.start].offset);
@@ -116,6 +160,7 @@ impl CoupledModes {
             let parts = self.split_level(level, level_coordinates, &mut level_accelerations[..level.len()]);
             run_parts(parts, |part| self.substitute(part, parent_coordinates, parent_accelerations));
         }
+        Ok(())
     }
 
     /// Splits a level, so that a thread gets at least `MIN_DOMAINS_PER_THREAD` bodies.
@@ -153,14 +198,15 @@ impl CoupledModes {
         });
     }
 
-    /// Computes the acceleration of the frame of every body from those of its parent, and the accelerations of its
-    /// coordinates.
+    /// Computes the acceleration of the frame of every body but the roots from those of its parent, and the accelerations
+    /// of its coordinates.
     fn substitute(&self, part: LevelPart<'_>, parent_coordinates: &[f64], parent_accelerations: &[Vector6<f64>]) {
         for_each_body(part, &self.tree, &self.factors, |body, factor, forces, frame| {
-            *frame = body.joint.as_ref().map_or_else(Vector6::zeros, |joint| {
+            if let Some(joint) = &body.joint {
                 let parent = &self.tree.bodies[joint.body];
-                joint.apply(&parent_accelerations[joint.body], &parent_coordinates[parent.offset..][..parent.rank])
-            });
+                let parent_coordinates = &parent_coordinates[parent.offset..][..parent.rank];
+                *frame = joint.apply(&parent_accelerations[joint.body], parent_coordinates);
+            }
             factor.solve(forces);
             for (acceleration, response) in forces.iter_mut().zip(&factor.frame_response) {
                 *acceleration -= response.dot(frame);
@@ -171,30 +217,25 @@ impl CoupledModes {
 
 impl Integrator for CoupledModes {
     fn advance(&self, state: &mut MotionState, load: LoadChange<'_>) -> Result<StepReport> {
-        let h = self.dt;
-        let mut accelerations = vec![0.0; state.q.len()];
-        let coordinates = || {
-            let bodies = self.tree.bodies.iter();
-            bodies.flat_map(|body| (0..body.rank).map(|mode| (body.offset + mode, body.first_coordinate + mode)))
-        };
-        for (position, index) in coordinates() {
-            let Some(ModeTerms { stiffness, damping }) = self.modes[index] else { continue };
-            let (q, v) = (state.q[index], state.v[index]);
-            let force = 0.5 * (load.start[index] + load.end[index]);
-            accelerations[position] = force - damping * v - stiffness * (q + 0.5 * h * v);
-        }
-        self.solve(&mut accelerations);
-        for (position, index) in coordinates() {
-            let velocity_change = h * accelerations[position];
-            state.q[index] += h * (state.v[index] + 0.5 * velocity_change);
-            state.v[index] += velocity_change;
-        }
+        let mut accelerations = self.right_side(state, |index| 0.5 * (load.start[index] + load.end[index]));
+        self.solve(&mut accelerations, |roots| {
+            roots.fill(Vector6::zeros());
+            Ok(())
+        })?;
+        self.add_step(state, &accelerations);
         Ok(StepReport { sub_steps: 1, ..StepReport::default() })
     }
 
     fn dt(&self) -> f64 {
         self.dt
     }
+}
+
+/// The matrix of a rigid motion at `offset` from the point whose motion it multiplies.
+fn transport_matrix(offset: &Vector3<f64>) -> Matrix6<f64> {
+    let mut matrix = Matrix6::identity();
+    matrix.fixed_view_mut::<3, 3>(0, 3).copy_from(&-offset.cross_matrix());
+    matrix
 }
 
 /// Runs `work` for all bodies of a part with their factors, coordinates and frames.

@@ -5,10 +5,11 @@ use nalgebra::{Vector3, Vector6};
 
 use super::joints::JointTree;
 use crate::error::Result;
-use crate::loads::{DomainLoads, split};
+use crate::loads::DomainLoads;
 use crate::model::{DomainModel, Model, Sample};
 use crate::parameters::{ModalParameters, ModeParameters};
 use crate::viewer_forces::force_scale;
+use crate::wrench::split;
 
 /// Largest displacement U q in a domain under the forces of viewers at rest, as a fraction of the domain's diagonal: the
 /// sum over its modes. At half the length, the linear modes of a beam are off by 29 %.

@@ -1,4 +1,4 @@
-use nalgebra::{DMatrix, DVector, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Vector3};
 
 use super::testing::{Branch, Random, create_scene, inertia_of_samples, point_masses, random_plant};
 use super::*;
@@ -63,15 +63,7 @@ fn energy(model: &Model, modes: &CoupledModes, state: &MotionState) -> f64 {
         .domains
         .iter()
         .zip(&frames)
-        .map(|(domain, frame)| {
-            let v = DVector::from_column_slice(domain.q(state.v.as_slice()));
-            let Some(inertia) = &domain.inertia else { return 0.5 * v.norm_squared() };
-            let rotation = domain.placement.linear.transpose();
-            let (translation, angle) = crate::loads::split(frame);
-            let frame = crate::loads::stack(&(rotation * translation), &(rotation * angle));
-            let momentum: Vector6<f64> = inertia.coupling.iter().zip(&v).map(|(column, v)| column * *v).sum();
-            0.5 * frame.dot(&(inertia.rigid * frame)) + frame.dot(&momentum) + 0.5 * v.dot(&(&inertia.modal * &v))
-        })
+        .map(|(domain, frame)| domain.kinetic_energy(frame, domain.q(state.v.as_slice())))
         .sum();
     let elastic = |(q, mode): (&f64, &Option<ModeTerms>)| mode.map_or(0.0, |mode| 0.5 * mode.stiffness * q * q);
     kinetic_energy + state.q.iter().zip(&modes.modes).map(elastic).sum::<f64>()

@@ -7,11 +7,11 @@ use crate::model::{DomainModel, Model};
 use crate::wind::{Wind, WindPressure, WindSettings};
 
 /// Cd of plates and of cylinders at a right angle to the wind (Hoerner 1965).
-const DRAG_COEFFICIENT: f64 = 1.2;
+pub(crate) const DRAG_COEFFICIENT: f64 = 1.2;
 
 /// A, the area that the wind sees, as a fraction of the surface area: that of a convex body on the average over all
 /// directions (Cauchy 1841).
-const PROJECTED_FRACTION: f64 = 0.25;
+pub(crate) const PROJECTED_FRACTION: f64 = 0.25;
 
 /// The typical distance between two domains as a fraction of the diagonal of the scene's bounds.
 const DISTANCE_FRACTION: f64 = 0.2;
@@ -83,7 +83,7 @@ impl WindExcitation {
         for (((domain, surface), pressure), wrench) in domains.zip(&mut loads.wrenches) {
             let WindPressure { downwind, crosswind } = pressure;
             let force = (self.directions[0] * downwind + self.directions[1] * crosswind) * surface.drag_area;
-            *wrench = crate::loads::stack(&force, &surface.center.cross(&force));
+            *wrench = crate::wrench::stack(&force, &surface.center.cross(&force));
             let coordinates = &mut loads.coordinates[domain.first_coordinate..][..domain.rank];
             for (coordinate, [along, across]) in coordinates.iter_mut().zip(&surface.modes) {
                 *coordinate += downwind * along + crosswind * across;

@@ -29,6 +29,7 @@ use crate::step_values::StepValues;
 use crate::viewer_forces::scale_remark;
 use crate::wind::Wind;
 use crown::Crown;
+pub(crate) use excitation::{DRAG_COEFFICIENT, PROJECTED_FRACTION};
 use excitation::{WindExcitation, WindOptions};
 
 /// Largest mean speed that [`default_wind_speed`] returns, in m/s: a fresh breeze, in which small trees sway.

@@ -4,6 +4,7 @@
 #[path = "../../../rust/tests/fake/mod.rs"]
 #[allow(dead_code, reason = "shared with the tests of the client")]
 mod fake;
+mod free;
 mod resume;
 
 use std::path::{Path, PathBuf};
