@@ -86,8 +86,9 @@ pub(crate) struct PhysicsOptions {
     #[command(flatten)]
     pub(crate) wind: WindOptions,
     /// Let every domain without a parent move and turn freely, with all that it carries: by the forces of viewers
-    /// (--forces) and, with --wind, by the wind relative to it. Needs the mass properties of the domains. Linear modes; there is no gravity and no contact. A body that is more than 5
-    /// diagonals of the scene away returns to rest.
+    /// (--forces) and, with --wind, by the wind relative to it. Needs the masses of the domains, which plants have and
+    /// `modalcast model` writes for parts without clamps. Linear modes; there is no gravity and no contact. A body that is
+    /// more than 5 diagonals of the scene away returns to rest.
     #[arg(long, conflicts_with_all = ["cubic", "deflection_fraction"])]
     pub(crate) free: bool,
     #[command(flatten)]

@@ -26,6 +26,8 @@
 //! | hold nodes, add point masses, assemble and solve | [`volume_modeling`], [`assembly`], [`eigensolver`] |
 //! | draw the surface, whose vertices are nodes | [`volume_surface`] |
 //!
+//! Both: [`mass_properties`] of a body without clamps, with which it can move freely.
+//!
 //! Large motion of a volume mesh:
 //!
 //! | step | module |
@@ -52,6 +54,7 @@ pub mod gmsh_file;
 pub mod grid;
 pub mod inside_outside;
 pub mod large_motion;
+pub mod mass_properties;
 pub mod material_rays;
 pub mod materials;
 pub mod modal_derivatives;

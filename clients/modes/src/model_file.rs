@@ -7,6 +7,7 @@ use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 
 use modalcast_model::error::{Result, fault_in, invalid};
+use nalgebra::Matrix3;
 use ndarray::{Array1, Array2, Array3};
 use ndarray_npy::WriteNpyExt as _;
 use sha2::{Digest as _, Sha256};
@@ -14,6 +15,7 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
 use crate::large_motion::SafeRange;
+use crate::mass_properties::rotated;
 use crate::materials::Material;
 use crate::modeling::{Modeling, to_hertz};
 use crate::parameters::ModelingParameters;
@@ -42,6 +44,14 @@ pub fn encode(source: ModelSource<'_>, parameters: &ModelingParameters, modeling
     }
     archive.add("U", &Array3::from_shape_vec((vertices, 3, rank), modes).map_err(fault_in("model"))?)?;
     archive.add("eigenvalues", &Array1::from_vec(modeling.eigenvalues.clone()))?;
+    if let Some(masses) = &modeling.mass_properties {
+        let columns: [[f64; 3]; 3] =
+            [0, 1, 2].map(|axis| turn_up([0, 1, 2].map(|row| f64::from(row == axis)), up_axis));
+        let rotation = Matrix3::from_fn(|row, column| columns[column][row]);
+        let turned = rotated(masses, &rotation);
+        let size = turned.nrows();
+        archive.add("inertia", &Array2::from_shape_fn((size, size), |(row, column)| turned[(row, column)]))?;
+    }
     let normals = mesh.corner_normals.as_flattened().iter().flat_map(|normal| turn_up(*normal, up_axis)).collect();
     archive.add("corner_normals", &Array3::from_shape_vec((faces, 3, 3), normals).map_err(fault_in("model"))?)?;
     if !mesh.material_colors.is_empty() {

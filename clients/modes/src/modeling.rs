@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use modalcast_model::error::{Result, invalid};
-use nalgebra::Vector3;
+use nalgebra::{DMatrix, Vector3};
 use rayon::prelude::*;
 
 use crate::assembly::SystemMatrices;
@@ -15,6 +15,7 @@ use crate::eigensolver::{ElasticModes, find_elastic_modes};
 use crate::embedding::{EmbeddedPoint, embed};
 use crate::grid::{CELL_NODES, Grid};
 use crate::large_motion::LargeMotion;
+use crate::mass_properties::{mass_properties, truncated};
 use crate::materials::Material;
 use crate::parameters::ModelingParameters;
 use crate::refinement::divide_long_edges;
@@ -50,6 +51,8 @@ pub struct Modeling {
     pub rigid_modes: usize,
     /// Kilograms, with point masses. Without the material in held regions, which a surface loses.
     pub mass: f64,
+    /// Those of [`mass_properties`] of a body without clamps.
+    pub mass_properties: Option<DMatrix<f64>>,
     /// Extents of the surface, meters.
     pub size: [f64; 3],
     pub damping_ratio: f64,
@@ -108,6 +111,7 @@ pub fn compute_modes(file: &SurfaceFile, parameters: &ModelingParameters, progre
         parts: layout.pieces.part_count,
         rigid_modes: solution.rigid_modes,
         mass: solution.mass,
+        mass_properties: solution.mass_properties.map(|masses| truncated(&masses, solution.modes.eigenvalues.len())),
         size: (high - low).into(),
         damping_ratio,
         large_motion: None,
@@ -165,6 +169,8 @@ struct Solution {
     modes: ElasticModes,
     rigid_modes: usize,
     mass: f64,
+    /// `None` with clamps.
+    mass_properties: Option<DMatrix<f64>>,
 }
 
 /// Assembles and solves the eigenproblem of one grid.
@@ -201,7 +207,9 @@ fn solve(
     let modes = find_elastic_modes(&system, &rigid, shift, count, &|share, stage| {
         progress(0.1 + 0.9 * share, stage);
     })?;
-    Ok(Solution { modes, rigid_modes: rigid.len(), mass })
+    let is_free = parameters.clamps.is_empty();
+    let mass_properties = is_free.then(|| mass_properties(&system, &node_positions(layout), &modes));
+    Ok(Solution { modes, rigid_modes: rigid.len(), mass, mass_properties })
 }
 
 /// The matrices of each piece. Full cells of one material share theirs.
@@ -257,6 +265,21 @@ fn add_outer_product(matrix: &mut [f64], weights: &[f64; CELL_NODES], scale: f64
             matrix[i * CELL_NODES + j] += scale * weight * other;
         }
     }
+}
+
+/// The positions of all nodes, meters.
+fn node_positions(layout: &Layout) -> Vec<Vector3<f64>> {
+    let grid = &layout.grid;
+    let mut positions = vec![Vector3::zeros(); layout.pieces.node_count];
+    for (index, nodes) in layout.pieces.nodes.iter().enumerate() {
+        let cell = grid.cell_at(layout.pieces.pieces[index].cell);
+        for (local, node) in nodes.iter().enumerate() {
+            let offset = node_coordinates(local);
+            let point = Vector3::from_fn(|axis, _| cell[axis] as f64 + offset[axis] as f64 / 2.0);
+            positions[*node as usize] = grid.origin + point * grid.cell_size;
+        }
+    }
+    positions
 }
 
 /// The rigid motions of the parts without held points.

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use crate::assembly::{HELD_NODE, SystemMatrices};
 use crate::eigensolver::{ElasticModes, find_elastic_modes};
 use crate::large_motion::add_large_motion;
+use crate::mass_properties::mass_properties;
 use crate::materials::Material;
 use crate::modeling::{
     Modeling, Progress, add_common_remarks, check_mode_count, remove_high_modes, rigid_motions, small_eigenvalue,
@@ -67,6 +68,9 @@ pub fn compute_volume_modes(
     let large_progress = |share: f64, stage: &str| progress(0.55 + 0.4 * share, stage);
     let add_large = || add_large_motion(&solid, &system, &rigid, shift, &mut modes, &large_progress);
     let large_motion = parameters.is_large.then(add_large).transpose()?;
+    // Without clamps, all nodes are free, in their order.
+    let is_free = parameters.clamps.is_empty();
+    let mass_properties = is_free.then(|| mass_properties(&system, &mesh.positions, &modes));
     progress(0.95, "surface");
     let (low, high) = mesh.bounds();
     let mut modeling = Modeling {
@@ -79,6 +83,7 @@ pub fn compute_volume_modes(
         parts: mesh.part_count,
         rigid_modes: rigid.len(),
         mass,
+        mass_properties,
         size: (high - low).into(),
         damping_ratio: parameters.damping_ratio.unwrap_or_else(|| mean_damping_ratio(mesh, &materials)),
         remarks: mesh.remarks.clone(),

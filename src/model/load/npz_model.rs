@@ -1,29 +1,31 @@
 //! Loader of NumPy archives with a mesh: the arrays `vertices` (n x 3) and `faces` (m x 3 or m x 4), and optionally
 //! `U`, `eigenvalues`, `normals` (n x 3), `corner_normals` (m x 3 x 3 or m x 4 x 3), `uvs` (n x 2, with (0, 0) at the top
 //! left), `colors` (n x 3 or n x 4, sRGB, 0 to 1 or 0 to 255), `face_materials` (m) with
-//! `material_colors` (k x 3 or k x 4, sRGB, 0 to 1, with alpha), and `notes` (a JSON object of texts, as bytes).
+//! `material_colors` (k x 3 or k x 4, sRGB, 0 to 1, with alpha), `inertia` ((6 + r) x (6 + r), the masses of the six rigid
+//! motions about the origin and of the modes), and `notes` (a JSON object of texts, as bytes).
 
 use std::collections::{BTreeMap, HashMap};
 
 use super::asset_dir::{AssetDir, MAX_MODEL_BYTES, stem_of};
 use super::modes::{
-    LoadedModes, NpzArchive, declare_npz_modes, declare_npz_notes, has_arrays, parse_f64, read_npz_modes,
+    FILE_NOTE, LoadedModes, NpzArchive, declare_npz_modes, declare_npz_notes, has_arrays, parse_f64, read_npz_modes,
     read_npz_notes,
 };
 use super::polygons::{self, Corner, NO_INDEX, PolygonMesh, build_bytes, linear_from_srgb};
 use super::surface::{self, ModelOptions};
 use super::values::Corrections;
-use crate::domain::{AlphaMode, Material};
+use crate::domain::{AlphaMode, Inertia, MAX_RANK, Material};
 use crate::error::{Result, invalid};
 use crate::scene::{Lighting, SceneParts, UpAxis};
 
 /// The arrays that are read. Other arrays are named in a remark.
-const ARRAY_NAMES: [&str; 12] = [
+const ARRAY_NAMES: [&str; 13] = [
     "vertices",
     "faces",
     "U",
     "modes",
     "eigenvalues",
+    "inertia",
     "normals",
     "corner_normals",
     "uvs",
@@ -42,6 +44,8 @@ struct ParsedModel {
     /// In the order of [`PolygonMesh::materials`].
     materials: Vec<Material>,
     modes: Option<LoadedModes>,
+    /// Mass properties with the modes.
+    inertia: Option<Inertia>,
     notes: BTreeMap<String, String>,
 }
 
@@ -64,6 +68,9 @@ pub(super) fn read(files: &AssetDir, name: &str, options: ModelOptions) -> Resul
     parts.unit = model.notes.contains_key("modes.unit").then_some(1.0);
     surface::add_domain(files, name, &model.polygons, options, model.modes, &mut parts)?;
     for domain in &mut parts.domains {
+        // Modes of another file, which replace those of the archive, have other masses.
+        let has_own_modes = domain.metadata.notes.get(FILE_NOTE).is_some_and(|file| file == name);
+        domain.metadata.inertia = model.inertia.clone().filter(|_| has_own_modes);
         let notes = model.notes.clone();
         // The notes on the files beside the archive win.
         domain.metadata.notes = notes.into_iter().chain(std::mem::take(&mut domain.metadata.notes)).collect();
@@ -113,13 +120,14 @@ fn parse(files: &AssetDir, bytes: &[u8], remarks: &mut Vec<String>) -> Result<Pa
     polygons.validate(|face| format!("array 'faces': row {face}"), 0)?;
     remarks.extend(polygons.corrections.remarks(files.is_strict())?);
     let modes = sizes.modes.as_ref().map(|name| read_npz_modes(&mut archive, name)).transpose()?;
+    let inertia = modes.as_ref().map(|modes| read_inertia(&mut archive, modes.modes.rank())).transpose()?.flatten();
     let notes = read_npz_notes(&mut archive)?;
     let unused: Vec<&str> =
         archive.names().iter().map(String::as_str).filter(|name| !ARRAY_NAMES.contains(name)).take(16).collect();
     if !unused.is_empty() {
         remarks.push(format!("arrays that are not used: {}", unused.join(", ")));
     }
-    Ok(ParsedModel { polygons, materials, modes, notes })
+    Ok(ParsedModel { polygons, materials, modes, inertia, notes })
 }
 
 /// Sizes from the headers of all arrays that are read.
@@ -173,6 +181,11 @@ impl ArraySizes {
         let materials = archive.declare("material_colors", check_materials)?.map_or(0, |shape| shape[0]);
         let has_modes = archive.names().iter().any(|name| name == "U" || name == "modes");
         let modes = if has_modes { Some(declare_npz_modes(archive)?) } else { None };
+        let check_masses = |shape: &[usize]| match shape {
+            [rows, columns] if rows == columns && (RIGID_MOTIONS..=RIGID_MOTIONS + MAX_RANK).contains(rows) => Ok(()),
+            _ => Err(invalid("shape", "(6 + r) x (6 + r)", format!("{shape:?}"))),
+        };
+        archive.declare("inertia", check_masses)?;
         declare_npz_notes(archive)?;
         Ok(Self { vertices, faces, sides, has_corner_normals, materials, modes })
     }
@@ -317,6 +330,53 @@ fn material_of_color(index: usize, color: &[f64]) -> Material {
 fn read_entries(archive: &mut NpzArchive<'_>, name: &str) -> Result<Option<(Vec<usize>, Vec<f64>)>> {
     let Some(bytes) = archive.read(name)? else { return Ok(None) };
     parse_f64(&bytes).map(Some).map_err(|error| error.prefix_field(&format!("array '{name}'")))
+}
+
+/// The number of rigid motions of a body: translations along the axes, then rotations about them.
+const RIGID_MOTIONS: usize = 6;
+
+/// Largest difference of a mass from that of a rigid body, as a fraction of the mass.
+const RIGID_TOLERANCE: f64 = 1e-6;
+
+/// Reads the masses of a body with `rank` modes: [[R^T M R, R^T M U], [U^T M R, U^T M U]].
+///
+/// # Errors
+/// `Invalid` unless the array has the size of the modes, and the masses of the rigid motions are those of a rigid body.
+fn read_inertia(archive: &mut NpzArchive<'_>, rank: usize) -> Result<Option<Inertia>> {
+    let Some((shape, masses)) = read_entries(archive, "inertia")? else { return Ok(None) };
+    let (size, in_array) = (RIGID_MOTIONS + rank, |error: crate::error::Error| error.prefix_field("array 'inertia'"));
+    if shape[0] != size {
+        let expected = format!("{size} x {size}, with {rank} modes");
+        return Err(in_array(invalid("shape", expected, format!("{shape:?}"))));
+    }
+    let entry = |row: usize, column: usize| masses[row * size + column];
+    let mass = entry(0, 0);
+    // The rows of the rotations are m c x, so that their columns have the center of mass.
+    let moment = [entry(5, 1), entry(3, 2), entry(4, 0)];
+    let expected = [
+        [mass, 0.0, 0.0, 0.0, moment[2], -moment[1]],
+        [0.0, mass, 0.0, -moment[2], 0.0, moment[0]],
+        [0.0, 0.0, mass, moment[1], -moment[0], 0.0],
+    ];
+    let scale = mass + moment.iter().map(|moment| moment.abs()).fold(0.0, f64::max);
+    // NaN equals nothing.
+    let is_equal = |a: f64, b: f64| (a - b).abs() <= RIGID_TOLERANCE * scale;
+    let differs = |(row, column): (usize, usize)| {
+        let is_rigid =
+            is_equal(entry(row, column), expected[row][column]) && is_equal(entry(column, row), entry(row, column));
+        !is_rigid
+    };
+    let mut translations = (0..3).flat_map(|row| (0..RIGID_MOTIONS).map(move |column| (row, column)));
+    if let Some((row, column)) = translations.find(|position| differs(*position)) {
+        let expected = format!("{} as of a rigid body of {mass} kg", expected[row][column]);
+        return Err(in_array(invalid(format!("row {row}, column {column}"), expected, entry(row, column))));
+    }
+    let center = moment.map(|moment| if mass > 0.0 { moment / mass } else { 0.0 });
+    let moments = [entry(3, 3), entry(4, 4), entry(5, 5), entry(3, 4), entry(3, 5), entry(4, 5)];
+    let momenta = (0..RIGID_MOTIONS).flat_map(|row| (0..rank).map(move |mode| entry(row, RIGID_MOTIONS + mode)));
+    let modal_rows =
+        (0..rank).flat_map(|row| (0..rank).map(move |mode| entry(RIGID_MOTIONS + row, RIGID_MOTIONS + mode)));
+    Inertia::new(mass, center, moments, momenta.collect(), modal_rows.collect()).map(Some).map_err(in_array)
 }
 
 /// Reads a declared array of vectors. Empty if the archive has no such array.
@@ -474,6 +534,67 @@ mod tests {
         let note = |name: &str, text: &str| (name.to_owned(), text.to_owned());
         assert_eq!(notes, [note("modes.file", "a.npz"), note("modes.material", "steel, 7850 kg/m\u{b3}")]);
         assert_eq!(parts.remarks, [""; 0]);
+    }
+
+    /// Masses of a body of 2 kg with its center at (0.5, 0, 1) and one mode, about the origin.
+    fn masses() -> ndarray::Array2<f64> {
+        let (mass, [x, _, z]) = (2.0, [0.5, 0.0, 1.0]);
+        let mut masses = ndarray::Array2::<f64>::eye(7);
+        for (row, column, value) in [
+            (0, 0, mass),
+            (1, 1, mass),
+            (2, 2, mass),
+            (0, 4, mass * z),
+            (1, 3, -mass * z),
+            (1, 5, mass * x),
+            (2, 4, -mass * x),
+            (3, 3, 3.0),
+            (4, 4, 4.0),
+            (5, 5, 2.5),
+            (3, 5, -1.0),
+            (0, 6, 0.125),
+        ] {
+            masses[[row, column]] = value;
+            masses[[column, row]] = value;
+        }
+        masses
+    }
+
+    #[test]
+    fn masses_become_the_inertia_of_the_domain() {
+        let u = npy(&ndarray::Array3::from_elem((4, 3, 1), 1.0_f32));
+        let read = |masses: &ndarray::Array2<f64>| {
+            read_arrays(&[square(), vec![("inertia", npy(masses)), ("U", u.clone())]].concat())
+        };
+        let parts = read(&masses()).expect("a valid archive");
+        let inertia = parts.domains[0].metadata.inertia.clone().expect("an inertia");
+        assert_eq!((inertia.mass(), inertia.center(), inertia.rank()), (2.0, [0.5, 0.0, 1.0], 1));
+        assert_eq!(inertia.moments(), [3.0, 4.0, 2.5, 0.0, -1.0, 0.0]);
+        assert_eq!(inertia.mass_matrix(), nalgebra::DMatrix::from_fn(7, 7, |row, column| masses()[[row, column]]));
+        assert_eq!(parts.remarks, [""; 0]);
+        let error = |change: &dyn Fn(&mut ndarray::Array2<f64>)| {
+            let mut masses = masses();
+            change(&mut masses);
+            read(&masses).expect_err("invalid masses").to_string()
+        };
+        for (message, text) in [
+            (error(&|masses| masses[[1, 1]] = 3.0), "array 'inertia': row 1, column 1: expected 2 as of a rigid body"),
+            (error(&|masses| masses[[0, 4]] = f64::NAN), "array 'inertia': row 0, column 4"),
+            (
+                error(&|masses| masses[[6, 6]] = -1.0),
+                "array 'inertia': inertia: expected masses and moments of at least 0",
+            ),
+            (
+                error(&|masses| *masses = ndarray::Array2::eye(8)),
+                "array 'inertia': shape: expected 7 x 7, with 1 modes",
+            ),
+            (error(&|masses| *masses = ndarray::Array2::eye(5)), "array 'inertia': shape: expected (6 + r) x (6 + r)"),
+        ] {
+            assert!(message.contains(text), "expected {text}, got {message}");
+        }
+        // Without modes, the masses belong to nothing.
+        let parts = read_arrays(&[square(), vec![("inertia", npy(&masses()))]].concat()).expect("a valid archive");
+        assert!(parts.domains[0].metadata.inertia.is_none());
     }
 
     #[test]
