@@ -5,7 +5,7 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use super::file_system::{FileSystem, write_atomic};
+use super::file_system::{FileSystem, make_private, write_atomic};
 use super::provenance::SceneProvenance;
 use super::recovery::{Recovery, StatePaths, write_source};
 use crate::engine::lock::lock;
@@ -40,6 +40,7 @@ impl SceneCatalog {
         }
         let folder_lock = File::create(folder.join("lock")).map_err(unusable_folder)?;
         folder_lock.try_lock().map_err(|_| unavailable(format!("{} is in use by another server", folder.display())))?;
+        make_private(folder).map_err(unusable_folder)?;
         file_system.sync_folder(folder).map_err(unusable_folder)?;
         let entries = Recovery { paths: &paths, file_system: &**file_system }.run().map_err(unusable_folder)?;
         let (entries, folder_lock) = (Mutex::new(entries), Mutex::new(Some(folder_lock)));
