@@ -77,6 +77,18 @@ impl std::fmt::Display for ListenAddress {
     }
 }
 
+/// How the server finds the principals of calls.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Authentication {
+    /// By the user of a Unix socket's client, or by a token.
+    #[default]
+    UsersAndTokens,
+    /// By a token, for machines on which several people share one account.
+    Tokens,
+    /// Every client is the owner.
+    Off,
+}
+
 /// The secret in the URL of the viewer. Its debug output does not show it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct ViewerToken(String);
@@ -132,6 +144,13 @@ pub struct Config {
     /// The path of a Unix socket for clients of the same user on this machine, which can send steps and receive
     /// vertices and frames in shared memory. `None` turns shared memory off.
     pub shared_memory: Option<PathBuf>,
+    /// The folder of a Unix socket `PORT.sock` for each TCP port that the server listens on. `None`: no sockets.
+    pub local_sockets: Option<PathBuf>,
+    pub authentication: Authentication,
+    /// The file that names the principals besides the owner; see `modalcast::identity`.
+    pub principals: Option<PathBuf>,
+    /// Whether addresses that other machines can connect to are allowed. Nothing that is sent there is encrypted.
+    pub insecure: bool,
     /// Whether browsers are served: the viewer and the WebSocket.
     pub viewer: bool,
     /// The secret in the URL of the viewer. `None` selects a random one.
@@ -241,6 +260,10 @@ impl Default for Config {
         Self {
             listen: vec![ListenAddress::Tcp((Ipv4Addr::LOCALHOST, 50051).into())],
             shared_memory: None,
+            local_sockets: None,
+            authentication: Authentication::default(),
+            principals: None,
+            insecure: false,
             viewer: true,
             viewer_token: None,
             viewer_recording: None,
@@ -292,6 +315,15 @@ impl Default for Config {
     }
 }
 
+/// The folder of the sockets by which programs of this user find its servers: `$XDG_RUNTIME_DIR/modalcast`, else `run`
+/// in the default state folder. Clients use the same rule.
+pub fn default_local_sockets() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR").filter(|path| !path.is_empty()) {
+        Some(runtime) => PathBuf::from(runtime).join("modalcast"),
+        None => default_state().join("run"),
+    }
+}
+
 /// The default state folder: `$XDG_STATE_HOME/modalcast`, else `~/.local/state/modalcast`, else `modalcast-state` in
 /// the working directory.
 fn default_state() -> PathBuf {
@@ -301,6 +333,11 @@ fn default_state() -> PathBuf {
 }
 
 impl Config {
+    /// The file of the server's own token.
+    pub fn token_file(&self) -> PathBuf {
+        self.state.join("token")
+    }
+
     /// Returns the configuration if every limit is in its range.
     ///
     /// # Errors
@@ -359,6 +396,17 @@ impl Config {
         check_range("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR_MS)?;
         if self.listen.is_empty() {
             return Err(invalid("config.listen", "at least one address", "none"));
+        }
+        let is_remote =
+            |address: &ListenAddress| matches!(address, ListenAddress::Tcp(address) if !address.ip().is_loopback());
+        if let Some(address) = self.listen.iter().find(|address| is_remote(address)) {
+            if self.authentication == Authentication::Off {
+                return Err(invalid("config.listen", "a loopback address without authentication", address));
+            }
+            if !self.insecure {
+                let expected = "a loopback address, or --insecure to send tokens and data without encryption";
+                return Err(invalid("config.listen", expected, address));
+            }
         }
         if self.state.as_os_str().is_empty() {
             return Err(invalid("config.state", "the path of a folder", "an empty path"));

@@ -29,9 +29,10 @@
 //!
 //! | module | contents | may use |
 //! |---|---|---|
-//! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `frame`, `telemetry` |
-//! | `modalcast::service` | gRPC services, and the viewer's page and WebSocket on the same port: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `telemetry` |
+//! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `identity`, `frame`, `telemetry` |
+//! | `modalcast::service` | gRPC services, and the viewer's page and WebSocket on the same port: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `identity`, `telemetry` |
 //! | `modalcast::engine` | the device thread, open scenes, step queues, subscriptions, forces, persistent state | `config`, `frame`, `telemetry` |
+//! | `modalcast::identity` | principals, their credentials and their roles | |
 //! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |
 //! | `modalcast::config` | all limits and paths, validated once | |
@@ -101,6 +102,7 @@ pub mod cli;
 pub mod config;
 pub mod engine;
 pub mod frame;
+pub mod identity;
 pub mod service;
 pub mod telemetry;
 

@@ -189,6 +189,10 @@ pub enum Reason {
     /// RESOURCE_EXHAUSTED: a scene or a frame needs more memory than the server allows. It is rejected before the memory is
     /// allocated. Metadata "object", "memory" (the limit), and in bytes "asked", "available" and "total".
     OutOfMemory = 21,
+    /// UNAUTHENTICATED: the call has no credential that the server knows, or its credential has been revoked.
+    Unauthenticated = 22,
+    /// PERMISSION_DENIED: the role of the caller does not permit the call.
+    PermissionDenied = 23,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -219,6 +223,8 @@ impl Reason {
             Self::StreamNotFound => "REASON_STREAM_NOT_FOUND",
             Self::ContentNotFound => "REASON_CONTENT_NOT_FOUND",
             Self::OutOfMemory => "REASON_OUT_OF_MEMORY",
+            Self::Unauthenticated => "REASON_UNAUTHENTICATED",
+            Self::PermissionDenied => "REASON_PERMISSION_DENIED",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -246,6 +252,8 @@ impl Reason {
             "REASON_STREAM_NOT_FOUND" => Some(Self::StreamNotFound),
             "REASON_CONTENT_NOT_FOUND" => Some(Self::ContentNotFound),
             "REASON_OUT_OF_MEMORY" => Some(Self::OutOfMemory),
+            "REASON_UNAUTHENTICATED" => Some(Self::Unauthenticated),
+            "REASON_PERMISSION_DENIED" => Some(Self::PermissionDenied),
             _ => None,
         }
     }
@@ -5688,8 +5696,8 @@ pub struct GetServerInfoResponse {
     #[prost(enumeration = "Feature", repeated, tag = "8")]
     pub features: ::prost::alloc::vec::Vec<i32>,
     /// The path and query of the viewer's URL, "/?token=" and the token. A client prepends the host and port at which it
-    /// reaches this server. Empty if the viewer is off. Web pages cannot read it, because browsers cannot make gRPC calls
-    /// over plain HTTP/2.
+    /// reaches this server. Empty if the viewer is off, and for callers without the role "admin", because the token
+    /// admits calls with that role.
     #[prost(string, tag = "9")]
     pub viewer_url_path: ::prost::alloc::string::String,
 }

@@ -13,6 +13,7 @@ mod recording;
 mod render;
 mod serve;
 mod sibling;
+mod token;
 mod view;
 
 use std::io::Write as _;
@@ -53,6 +54,7 @@ enum Command {
     /// Measures error against run time on this machine and writes tables and plots.
     #[command(after_help = REPORT_EXAMPLES, disable_help_flag = true)]
     Report(sibling::Args),
+    Token(token::Args),
     Inspect(inspect::Args),
     Doctor(doctor::Args),
 }
@@ -143,6 +145,7 @@ pub fn run() -> u8 {
         Command::Model(args) => sibling::MODES.execute(None, &args),
         Command::Report(args) => sibling::REPORT.execute(None, &args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Token(args) => token::run(&args),
         Command::Doctor(args) => doctor::run(&args),
     };
     finish(outcome)

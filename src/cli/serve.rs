@@ -8,7 +8,10 @@ use std::time::Duration;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Completion, Outcome, print_line};
-use crate::config::{BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken};
+use crate::config::{
+    Authentication, BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken,
+    default_local_sockets,
+};
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault_in};
@@ -19,7 +22,7 @@ use modalcast_model::load::{LoadOptions, SceneRepository};
 #[command(after_help = "Examples:
   modalcast serve                                   built-in scenes, for clients on this machine
   modalcast serve --scenes ~/scenes                 also the scenes of a folder
-  modalcast serve --listen 0.0.0.0:50051            also for clients on other machines
+  modalcast serve --listen 0.0.0.0:50051 --insecure also for clients on other machines, with the token
   modalcast serve --listen unix:/run/user/1000/modalcast.sock
   modalcast serve --backend cpu --renderer software without a GPU")]
 pub(super) struct Args {
@@ -31,6 +34,22 @@ pub(super) struct Args {
     /// vertices and frames. Default: off.
     #[arg(long, env = "MODALCAST_SHARED_MEMORY", value_name = "PATH")]
     shared_memory: Option<PathBuf>,
+    /// TOML file that names further users of the server, with their roles and credentials. It is read again when it changes.
+    /// Without it, only this user is admitted: over the Unix socket that the server opens beside each TCP port, and elsewhere
+    /// with the token in the file 'token' of the state folder.
+    #[arg(long, env = "MODALCAST_PRINCIPALS", value_name = "FILE")]
+    principals: Option<PathBuf>,
+    /// Do not identify users by their account: programs of this user need the token, too. For accounts that several people
+    /// share.
+    #[arg(long)]
+    tokens_only: bool,
+    /// Admit everybody who can connect, with all rights. Only for addresses of this machine: every program on it can then
+    /// stop, change and delete everything.
+    #[arg(long, conflicts_with_all = ["principals", "tokens_only"])]
+    no_auth: bool,
+    /// Allow addresses that other machines can connect to. Tokens and data are not encrypted there.
+    #[arg(long)]
+    insecure: bool,
     /// Do not serve browsers: neither the viewer nor the WebSocket.
     #[arg(long)]
     no_viewer: bool,
@@ -143,11 +162,24 @@ fn default_ms(duration: Duration) -> u64 {
 }
 
 impl Args {
+    const fn authentication(&self) -> Authentication {
+        match (self.no_auth, self.tokens_only) {
+            (true, _) => Authentication::Off,
+            (false, true) => Authentication::Tokens,
+            (false, false) => Authentication::UsersAndTokens,
+        }
+    }
+
     fn config(&self) -> Result<ValidatedConfig> {
         let defaults = Config::default();
         Config {
             listen: self.listen.clone(),
             shared_memory: self.shared_memory.clone(),
+            // Without authentication, clients need no other address than that of TCP.
+            local_sockets: (!self.no_auth).then(default_local_sockets),
+            authentication: self.authentication(),
+            principals: self.principals.clone(),
+            insecure: self.insecure,
             viewer: !self.no_viewer,
             viewer_token: self.viewer_token.clone(),
             scenes: self.scenes.clone(),
@@ -224,13 +256,26 @@ pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)>
 /// Logs the devices and prints the addresses.
 pub(super) fn announce(engine: &Engine, listener: &Listener) {
     log_devices(engine.info());
+    log_authentication(engine.config());
     print_addresses(listener);
+}
+
+/// Logs how clients are admitted.
+fn log_authentication(config: &Config) {
+    let token_file = config.token_file();
+    match config.authentication {
+        Authentication::Off => tracing::warn!("no authentication: everybody who can connect may do everything"),
+        Authentication::Tokens => tracing::info!("clients need a token, as in {}", token_file.display()),
+        Authentication::UsersAndTokens => {
+            tracing::info!("clients of other users and machines need a token, as in {}", token_file.display());
+        }
+    }
 }
 
 /// Prints the addresses. Warns about those that other machines can connect to.
 pub(super) fn print_addresses(listener: &Listener) {
     for address in listener.remote_addresses() {
-        tracing::warn!("{address} accepts clients on other machines, without authentication");
+        tracing::warn!("{address} accepts clients on other machines, and encrypts nothing");
     }
     for url in listener.urls() {
         print_line(format!("listening on {url}"));

@@ -13,7 +13,9 @@ use super::modeling_options::ModelingOptions;
 use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
 use super::{Completion, Outcome, print_line, recording};
-use crate::config::{BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording};
+use crate::config::{
+    BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording, default_local_sockets,
+};
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::load::{self, LoadOptions};
@@ -34,7 +36,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view part.msh --unit mm                 a volume mesh, whose modes are computed
   modalcast view fork.npz --slow 500                pulled, and seen in slower motion than by default
   modalcast view tree.mcap                          plays a recording
-  modalcast view model.glb --listen 0.0.0.0:50051   also for browsers on other machines")]
+  modalcast view model.glb --listen 0.0.0.0:50051 --insecure   also for browsers on other machines")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl, .npz or
     /// .structure.json file, a folder with one model, a volume mesh (.msh, .vtk, .vtu or .veg), whose modes are
@@ -43,6 +45,9 @@ pub(super) struct Args {
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
     #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
     listen: SocketAddr,
+    /// Allow an address that other machines can connect to. Tokens and data are not encrypted there.
+    #[arg(long)]
+    insecure: bool,
     /// Print the URL and do not open a browser.
     #[arg(long)]
     no_open: bool,
@@ -101,6 +106,8 @@ impl Args {
     fn config(&self, location: &SceneLocation, state: &Path) -> Result<ValidatedConfig> {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
+            local_sockets: Some(default_local_sockets()),
+            insecure: self.insecure,
             scenes: location.repository.clone(),
             load_options: self.load_options(),
             state: state.to_owned(),
@@ -115,6 +122,8 @@ impl Args {
     fn playback_config(&self, state: &Path) -> Result<ValidatedConfig> {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
+            local_sockets: Some(default_local_sockets()),
+            insecure: self.insecure,
             viewer_recording: Some(ViewerRecording {
                 file: recording::read(&self.model)?,
                 slow: self.slow.unwrap_or(1.0),

@@ -15,10 +15,11 @@ use tokio::io::AsyncReadExt as _;
 use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
 
+use super::authentication::Authenticator;
 use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
 use super::connection_table::{ConnectionSlot, ConnectionTable, GOAWAY_TIMEOUT};
 use super::control_frames::ControlFrameLimit;
-use super::listen::{ListeningSockets, Socket};
+use super::listen::{ListeningSockets, Peer, Socket};
 use super::metered_socket::MeteredSocket;
 use super::routes::Routes;
 use super::web::WebServer;
@@ -40,15 +41,22 @@ pub(super) struct ConnectionServer {
     /// Serves HTTP/1.1. `None` if the viewer is off.
     web: Option<WebServer>,
     http2: http2::Builder<TokioExecutor>,
+    authenticator: Arc<Authenticator>,
     budgets: Budgets,
     handshake_timeout: Duration,
     first_request_timeout: Duration,
 }
 
 impl ConnectionServer {
-    pub(super) fn new(routes: Routes, web: Option<WebServer>, config: &Config) -> Arc<Self> {
+    pub(super) fn new(
+        routes: Routes,
+        web: Option<WebServer>,
+        authenticator: Arc<Authenticator>,
+        config: &Config,
+    ) -> Arc<Self> {
         Arc::new(Self {
             routes,
+            authenticator,
             web,
             http2: http2_builder(config),
             budgets: Budgets::new(config),
@@ -76,20 +84,27 @@ impl ConnectionServer {
     }
 
     /// Serves a connection until it ends or must be closed.
-    async fn serve(self: Arc<Self>, socket: Socket, peer: String, slot: ConnectionSlot) {
+    async fn serve(self: Arc<Self>, socket: Socket, peer: Peer, slot: ConnectionSlot) {
         tokio::select! {
             () = slot.signals.close.notified() => {}
             () = self.serve_until_retired(socket, peer, &slot) => {}
         }
     }
 
-    async fn serve_until_retired(&self, mut socket: Socket, peer: String, slot: &ConnectionSlot) {
+    async fn serve_until_retired(&self, mut socket: Socket, peer: Peer, slot: &ConnectionSlot) {
         let protocol = tokio::time::timeout(self.handshake_timeout, detect_protocol(&mut socket));
         let Ok(Ok(Some(protocol))) = protocol.await else { return };
-        let info = ConnectionInfo::new(peer, &self.budgets, slot);
+        let info_with = |credential| ConnectionInfo::new(&peer.name, credential, &self.budgets, slot);
         match (protocol, &self.web) {
-            (Protocol::Http2, _) => self.serve_http2(socket, &info, slot).await,
-            (Protocol::Other(first_bytes), Some(web)) => web.serve(socket, first_bytes, info, slot).await,
+            (Protocol::Http2, _) => {
+                let credential = self.authenticator.credential_of_connection(peer.uid);
+                self.serve_http2(socket, &info_with(credential), slot).await;
+            }
+            (Protocol::Other(first_bytes), Some(web)) => {
+                // The token in the URL of the viewer is a credential of the owner.
+                let credential = Arc::clone(self.authenticator.directory().owner());
+                web.serve(socket, first_bytes, info_with(Some(credential)), slot).await;
+            }
             (Protocol::Other(_), None) => {}
         }
     }

@@ -11,6 +11,7 @@ use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::config::Config;
 use crate::engine::{ClientId, LeaseToken};
+use crate::identity::Credential;
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams,
@@ -55,6 +56,8 @@ pub(super) struct ConnectionInfo {
     id: u64,
     /// Never sent to another client.
     peer: Arc<str>,
+    /// The credential of calls without a token.
+    pub(super) credential: Option<Arc<Credential>>,
     drive_permits: Arc<Semaphore>,
     /// One permit per pixel of single frames.
     frame_pixels: Arc<Semaphore>,
@@ -76,10 +79,16 @@ impl ConnectionInfo {
         connection.ok_or_else(|| fault("connection", "expected a connection of this server, got none"))
     }
 
-    pub(super) fn new(peer: String, budgets: &Budgets, slot: &ConnectionSlot) -> Self {
+    pub(super) fn new(
+        peer: &str,
+        credential: Option<Arc<Credential>>,
+        budgets: &Budgets,
+        slot: &ConnectionSlot,
+    ) -> Self {
         Self {
             id: CONNECTION_COUNTER.fetch_add(1, Ordering::Relaxed),
             peer: peer.into(),
+            credential,
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
             frame_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
             stream_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
@@ -102,8 +111,8 @@ impl ConnectionInfo {
     }
 
     /// Name of the client, for the log: its address, or its process.
-    pub(super) fn peer(&self) -> String {
-        self.peer.to_string()
+    pub(super) fn peer(&self) -> &str {
+        &self.peer
     }
 
     /// Counts a step stream until the permit is dropped.

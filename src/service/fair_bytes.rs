@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::oneshot;
 use tonic::Status;
 
+use super::status::internal_fault;
 use crate::engine::lock;
 
 /// The bytes of all holders.
@@ -98,7 +99,7 @@ impl ByteHolder {
         let _update = UpdateOnDrop(&self.total);
         let (grant, granted) = oneshot::channel();
         self.total.update(|state| state.waiting.push(Waiter { holder: Arc::clone(self), bytes, grant }));
-        granted.await.map_err(|_| Status::internal("a wait for the reply budget was lost"))
+        granted.await.map_err(|_| internal_fault("a wait for the reply budget was lost"))
     }
 }
 

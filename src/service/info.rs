@@ -6,8 +6,10 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
 use super::connection::MAX_DRIVES;
+use super::routes::caller;
 use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
+use crate::identity::Role;
 
 /// Implementation of `ServerService`.
 pub(super) struct ServerServiceImpl {
@@ -20,8 +22,10 @@ pub(super) struct ServerServiceImpl {
 impl v1::server_service_server::ServerService for ServerServiceImpl {
     async fn get_server_info(
         &self,
-        _: Request<v1::GetServerInfoRequest>,
+        request: Request<v1::GetServerInfoRequest>,
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
+        // The token in the URL of the viewer admits calls of the owner.
+        let is_admin = caller(&request).is_some_and(|credential| credential.principal().role == Role::Admin);
         let info = self.engine.info();
         let config = self.engine.config();
         let (renderer, is_software) = match &info.renderer {
@@ -55,7 +59,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             limits: Some(limits),
             protocol_version: v1::PROTOCOL_VERSION,
             features: list_features(info, config).into_iter().map(Into::into).collect(),
-            viewer_url_path: self.viewer_url_path.clone(),
+            viewer_url_path: if is_admin { self.viewer_url_path.clone() } else { String::new() },
         }))
     }
 }

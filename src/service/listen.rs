@@ -1,20 +1,23 @@
 //! The sockets that the server listens on: TCP and Unix sockets.
 
+use std::collections::BTreeSet;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr};
-use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
+use std::os::unix::fs::{DirBuilderExt as _, FileTypeExt as _, MetadataExt as _, PermissionsExt as _};
 use std::path::{Path, PathBuf};
 use std::pin::Pin;
+use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
+use super::authentication::Authenticator;
 use crate::config::{Config, ListenAddress, ViewerToken};
 use modalcast_model::error::{Error, Result};
 
-/// Bound sockets. Dropping it removes the files of the Unix sockets.
-#[derive(Debug, Default)]
+/// Bound sockets, and what is needed to admit their clients. Dropping it removes the files of the Unix sockets.
+#[derive(Debug)]
 pub struct Listener {
     pub(super) sockets: ListeningSockets,
     /// The socket for shared memory, if it is on.
@@ -26,6 +29,7 @@ pub struct Listener {
     addresses: Vec<SocketAddr>,
     /// `None` if the viewer is off.
     pub(super) viewer_token: Option<ViewerToken>,
+    pub(super) authenticator: Arc<Authenticator>,
 }
 
 /// The sockets of a listener.
@@ -36,6 +40,15 @@ pub(super) struct ListeningSockets(Vec<ListeningSocket>);
 enum ListeningSocket {
     Tcp(TcpListener),
     Unix(UnixListener),
+}
+
+/// The other end of a connection.
+#[derive(Debug)]
+pub(super) struct Peer {
+    /// For the log: its address, or its process.
+    pub(super) name: String,
+    /// The user of a Unix socket's client at the time of its connection.
+    pub(super) uid: Option<u32>,
 }
 
 /// The connection of a client.
@@ -49,10 +62,18 @@ impl Listener {
     /// Binds all sockets of a configuration. Replaces the socket file of a server that no longer runs.
     ///
     /// # Errors
-    /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created; `Fault` when the
-    /// system has no random numbers.
+    /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created; `InvalidFile` for
+    /// the file of principals; `Fault` when the system has no random numbers.
     pub(super) async fn bind(config: &Config) -> Result<Self> {
-        let mut listener = Self::default();
+        let mut listener = Self {
+            sockets: ListeningSockets::default(),
+            shared_memory: None,
+            files: Vec::new(),
+            urls: Vec::new(),
+            addresses: Vec::new(),
+            viewer_token: None,
+            authenticator: Authenticator::new(config)?,
+        };
         if config.viewer {
             let token = config.viewer_token.clone();
             listener.viewer_token = Some(token.map_or_else(ViewerToken::random, Ok)?);
@@ -64,6 +85,9 @@ impl Listener {
                 remedy: "Set another address with --listen".into(),
             })?;
         }
+        if let Some(folder) = &config.local_sockets {
+            listener.add_local_sockets(folder);
+        }
         if let Some(path) = &config.shared_memory {
             listener.add_shared_memory(path).map_err(|error| Error::Unavailable {
                 what: "socket for shared memory",
@@ -72,6 +96,27 @@ impl Listener {
             })?;
         }
         Ok(listener)
+    }
+
+    /// Adds a socket for each TCP port, which programs of this user find by the port. The server runs without those that
+    /// cannot be created.
+    fn add_local_sockets(&mut self, folder: &Path) {
+        let ports: BTreeSet<u16> = self.addresses.iter().map(SocketAddr::port).collect();
+        for port in ports {
+            let path = folder.join(format!("{port}.sock"));
+            let bind = || {
+                create_private_folder(folder)?;
+                SocketFile::bind(&path)
+            };
+            match bind() {
+                Ok((socket, file)) => {
+                    self.urls.push(ListenAddress::Unix(path).to_string());
+                    self.files.push(file);
+                    self.sockets.0.push(ListeningSocket::Unix(socket));
+                }
+                Err(error) => tracing::warn!("programs of this user need a token: {}: {error}", path.display()),
+            }
+        }
     }
 
     fn add_shared_memory(&mut self, path: &Path) -> io::Result<()> {
@@ -149,8 +194,8 @@ pub fn host_name() -> Option<String> {
 }
 
 impl ListeningSockets {
-    /// Accepts a connection on any of the sockets, and returns it with the name of its client. Cancel-safe.
-    pub(super) async fn accept(&self) -> io::Result<(Socket, String)> {
+    /// Accepts a connection on any of the sockets, and returns it with its client. Cancel-safe.
+    pub(super) async fn accept(&self) -> io::Result<(Socket, Peer)> {
         let poll_accept = |cx: &mut Context<'_>| {
             let ready = self.0.iter().find_map(|socket| match socket.poll_accept(cx) {
                 Poll::Ready(result) => Some(result),
@@ -163,19 +208,37 @@ impl ListeningSockets {
 }
 
 impl ListeningSocket {
-    fn poll_accept(&self, cx: &mut Context<'_>) -> Poll<io::Result<(Socket, String)>> {
+    fn poll_accept(&self, cx: &mut Context<'_>) -> Poll<io::Result<(Socket, Peer)>> {
         match self {
             Self::Tcp(listener) => listener.poll_accept(cx)?.map(|(stream, peer)| {
                 stream.set_nodelay(true)?;
-                Ok((Socket::Tcp(stream), peer.to_string()))
+                Ok((Socket::Tcp(stream), Peer { name: peer.to_string(), uid: None }))
             }),
             Self::Unix(listener) => listener.poll_accept(cx)?.map(|(stream, _)| {
-                let pid = stream.peer_cred().ok().and_then(|credentials| credentials.pid());
-                let peer = pid.map_or_else(|| "unix socket".to_owned(), |pid| format!("process {pid}"));
-                Ok((Socket::Unix(stream), peer))
+                let credentials = stream.peer_cred().ok();
+                let uid = credentials.map(|credentials| credentials.uid());
+                let pid = credentials.and_then(|credentials| credentials.pid());
+                let name = pid.map_or_else(|| "unix socket".to_owned(), |pid| format!("process {pid}"));
+                Ok((Socket::Unix(stream), Peer { name, uid }))
             }),
         }
     }
+}
+
+/// Creates a folder that only the user of this process can enter.
+///
+/// # Errors
+/// An I/O error, also when the folder belongs to another user or others can enter it.
+fn create_private_folder(folder: &Path) -> io::Result<()> {
+    std::fs::DirBuilder::new().recursive(true).mode(0o700).create(folder)?;
+    let metadata = std::fs::symlink_metadata(folder)?;
+    let own_uid = rustix::process::geteuid().as_raw();
+    if !metadata.is_dir() || metadata.uid() != own_uid || metadata.mode() & 0o077 != 0 {
+        let given = format!("mode {:o} of user {}", metadata.mode() & 0o7777, metadata.uid());
+        let text = format!("expected a folder of user {own_uid} with mode 700, got {given}");
+        return Err(io::Error::new(io::ErrorKind::PermissionDenied, text));
+    }
+    Ok(())
 }
 
 /// The file of a Unix socket. Dropping it removes the file.
@@ -288,11 +351,16 @@ impl AsyncWrite for Socket {
 mod tests {
     use super::*;
 
+    fn config(folder: &Path, socket: &Path) -> Config {
+        let listen = vec![ListenAddress::Unix(socket.to_owned())];
+        Config { listen, state: folder.join("state"), ..Config::default() }
+    }
+
     #[tokio::test]
     async fn stale_socket_is_replaced_and_other_files_are_kept() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let path = folder.path().join("socket");
-        let config = Config { listen: vec![ListenAddress::Unix(path.clone())], ..Config::default() };
+        let config = config(folder.path(), &path);
         // A standard library listener leaves its file, as a killed server does.
         drop(std::os::unix::net::UnixListener::bind(&path).expect("expected a socket"));
         let listener = Listener::bind(&config).await.expect("expected the stale socket to be replaced");
@@ -300,10 +368,33 @@ mod tests {
         let error = Listener::bind(&config).await.expect_err("expected a socket in use").to_string();
         assert!(error.contains("another server"), "{error}");
         drop(listener);
-        assert_eq!(std::fs::read_dir(folder.path()).expect("expected a folder").count(), 0);
+        let names = std::fs::read_dir(folder.path()).expect("expected a folder");
+        let names: Vec<_> = names.map(|entry| entry.expect("expected an entry").file_name()).collect();
+        assert_eq!(names, ["state"]);
         std::fs::write(&path, "text").expect("expected a writable folder");
         assert!(Listener::bind(&config).await.is_err());
         assert_eq!(std::fs::read_to_string(&path).expect("expected the file"), "text");
+    }
+
+    #[tokio::test]
+    async fn local_socket_has_the_name_of_the_port_in_a_private_folder() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let sockets = folder.path().join("a").join("modalcast");
+        let listen = vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())];
+        let state = folder.path().join("state");
+        let config = Config { listen, local_sockets: Some(sockets.clone()), state, ..Config::default() };
+        let listener = Listener::bind(&config).await.expect("expected sockets");
+        let port = listener.addresses[0].port();
+        let path = sockets.join(format!("{port}.sock"));
+        assert_eq!(listener.urls()[1], format!("unix:{}", path.display()));
+        let mode = |path: &Path| std::fs::metadata(path).expect("expected a file").permissions().mode() & 0o777;
+        assert_eq!((mode(&path), mode(&sockets)), (0o600, 0o700));
+        drop(listener);
+        assert!(!path.exists());
+        // Others could replace sockets in this folder, so the server has none there.
+        std::fs::set_permissions(&sockets, std::fs::Permissions::from_mode(0o777)).expect("expected new permissions");
+        let listener = Listener::bind(&config).await.expect("expected a server without the socket");
+        assert_eq!(listener.urls().len(), 1);
     }
 
     /// A server that was replaced does not remove the socket of its successor.
@@ -311,7 +402,7 @@ mod tests {
     async fn only_the_own_socket_file_is_removed() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let path = folder.path().join("socket");
-        let config = Config { listen: vec![ListenAddress::Unix(path.clone())], ..Config::default() };
+        let config = config(folder.path(), &path);
         let first = Listener::bind(&config).await.expect("expected a socket");
         std::fs::remove_file(&path).expect("expected the file");
         let _second = Listener::bind(&config).await.expect("expected a socket");

@@ -2,6 +2,7 @@
 //! protobuf types.
 
 mod accept;
+mod authentication;
 mod connection;
 mod connection_table;
 mod control_frames;
@@ -14,12 +15,14 @@ mod frames;
 mod info;
 mod listen;
 mod metered_socket;
+mod permissions;
 mod picks;
 mod progress_timer;
 mod receive_budget;
 mod reply_body;
 mod reply_budget;
 mod request_body;
+mod revocable_body;
 mod routes;
 mod scenes;
 mod shared_memory;
@@ -43,6 +46,7 @@ use tonic_health::server::HealthReporter;
 pub use self::listen::{Listener, host_name};
 
 use self::accept::ConnectionServer;
+use self::authentication::Authenticator;
 use self::connection_table::ConnectionTable;
 use self::routes::Routes;
 use self::shared_memory::SharedMemory;
@@ -80,13 +84,14 @@ pub async fn serve(
     health.set(true).await;
     let shared_memory = SharedMemory::default();
     let viewer_url_path = listener.viewer_url_path().unwrap_or_default();
-    let routes = routes(&engine, &config, &shared_memory, viewer_url_path)?.with(health_server);
+    let authenticator = Arc::clone(&listener.authenticator);
+    let routes = routes(&engine, &config, &shared_memory, &authenticator, viewer_url_path)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
     let web = listener.viewer_token.clone().map(|token| {
         let access = Access::new(token, host_name().filter(|_| accepts_machines));
         WebServer::new(routes.clone(), access, Arc::clone(&health.is_serving), &config)
     });
-    let connection_server = ConnectionServer::new(routes, web.transpose()?, &config);
+    let connection_server = ConnectionServer::new(routes, web.transpose()?, Arc::clone(&authenticator), &config);
     // The files are removed when this function returns.
     let Listener { sockets, shared_memory: shared_memory_socket, files: _files, .. } = listener;
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
@@ -110,6 +115,7 @@ pub async fn serve(
     let (drain_deadline, loss) = tokio::select! {
         () = accept_connections => return Ok(()),
         () = report_state => return Ok(()),
+        () = authenticator.directory().keep_fresh() => return Ok(()),
         stopped = stop_engine => stopped,
     };
     if tokio::time::timeout_at(drain_deadline, table.retire_all()).await.is_err() {
@@ -189,7 +195,13 @@ impl Health {
     }
 }
 
-fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory, viewer_url_path: String) -> Result<Routes> {
+fn routes(
+    engine: &Engine,
+    config: &Config,
+    shared_memory: &SharedMemory,
+    authenticator: &Arc<Authenticator>,
+    viewer_url_path: String,
+) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
     use v1::scene_service_server::SceneServiceServer;
@@ -211,7 +223,7 @@ fn routes(engine: &Engine, config: &Config, shared_memory: &SharedMemory, viewer
     let frame_service = frames::FrameServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let vertex_service = vertices::VertexServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let step_service = steps::StepServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
-    Ok(Routes::new(config.message_bytes)
+    Ok(Routes::new(Arc::clone(authenticator), config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
@@ -248,7 +260,9 @@ mod tests {
     async fn lost_device_turns_health_to_not_serving_and_ends_the_server() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let listen = crate::config::ListenAddress::Tcp(([127, 0, 0, 1], 0).into());
-        let config = Config { listen: vec![listen], state: folder.path().to_owned(), ..Config::default() };
+        let authentication = crate::config::Authentication::Off;
+        let state = folder.path().to_owned();
+        let config = Config { listen: vec![listen], authentication, state, ..Config::default() };
         let config = config.validated().expect("expected a valid configuration");
         let listener = bind(&config).await.expect("expected a free port");
         let address = listener.urls()[0].clone();

@@ -21,6 +21,7 @@ use tonic::{Response, Status};
 
 use super::MAX_REPLY_BYTES;
 use super::reply_budget::{UnsentBytes, count_until_sent};
+use super::status::internal_fault;
 
 /// Data of at least this size are sent as a frame of their own. Copying fewer bytes costs less than a further frame.
 const MIN_DATA_FRAME: usize = 16 << 10;
@@ -135,7 +136,7 @@ impl EncodedMessage {
         let length = message.encoded_len();
         if length > MAX_REPLY_BYTES {
             let expected = format!("expected a reply of at most {MAX_REPLY_BYTES} bytes");
-            return Err(Status::internal(format!("{expected}, got {length}")));
+            return Err(internal_fault(format!("{expected}, got {length}")));
         }
         let large_data = message.data().filter(|field| field.data.len() >= MIN_DATA_FRAME);
         let large_data = large_data.map(|field| (mem::take(field.data), field.number, field.is_in_chunk));
@@ -144,13 +145,13 @@ impl EncodedMessage {
         head.put_u8(0);
         head.put_u32(length as u32);
         let Some((data, number, is_in_chunk)) = large_data else {
-            message.encode(&mut head).map_err(|error| Status::internal(error.to_string()))?;
+            message.encode(&mut head).map_err(|error| internal_fault(error.to_string()))?;
             return Ok(Self { head, large_data: None });
         };
         if is_in_chunk {
             encode_chunk_without_data(&message, data.len(), &mut head)?;
         } else {
-            message.encode(&mut head).map_err(|error| Status::internal(error.to_string()))?;
+            message.encode(&mut head).map_err(|error| internal_fault(error.to_string()))?;
         }
         head.put_u8(number << 3 | LENGTH_DELIMITED);
         put_length(data.len(), &mut head)?;
@@ -164,19 +165,19 @@ impl EncodedMessage {
 }
 
 fn put_length(length: usize, buffer: &mut BytesMut) -> Result<(), Status> {
-    prost::encode_length_delimiter(length, buffer).map_err(|error| Status::internal(error.to_string()))
+    prost::encode_length_delimiter(length, buffer).map_err(|error| internal_fault(error.to_string()))
 }
 
 /// Encodes a message with a chunk up to the field `data`, of which there are `data_length` bytes. `message` has a chunk
 /// without data.
 fn encode_chunk_without_data(message: &impl Message, data_length: usize, buffer: &mut BytesMut) -> Result<(), Status> {
-    let invalid = |error: prost::DecodeError| Status::internal(error.to_string());
+    let invalid = |error: prost::DecodeError| internal_fault(error.to_string());
     // The key of the chunk, the length of the chunk, and the chunk.
     let mut encoded = Bytes::from(message.encode_to_vec());
-    let chunk_key = encoded.try_get_u8().map_err(|_| Status::internal("expected a reply with a chunk"))?;
+    let chunk_key = encoded.try_get_u8().map_err(|_| internal_fault("expected a reply with a chunk"))?;
     let chunk_length = prost::decode_length_delimiter(&mut encoded).map_err(invalid)?;
     if encoded.len() != chunk_length {
-        return Err(Status::internal("expected a reply with nothing but a chunk"));
+        return Err(internal_fault("expected a reply with nothing but a chunk"));
     }
     buffer.put_u8(chunk_key);
     put_length(chunk_length + 1 + prost::length_delimiter_len(data_length) + data_length, buffer)?;

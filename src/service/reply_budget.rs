@@ -21,6 +21,7 @@ use tonic::body::Body;
 
 use super::connection_table::CountedCall;
 use super::fair_bytes::{ByteGrant, ByteHolder, FairBytes};
+use super::status::internal_fault;
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
@@ -289,7 +290,7 @@ impl CallReplies {
         let of_connection = Arc::clone(&connection.permits).acquire_many_owned(permits as u32);
         let of_connection = search_while_waiting(of_connection, interval, end_own)
             .await
-            .map_err(|_| Status::internal("the reply budget is closed"))?;
+            .map_err(|_| internal_fault("the reply budget is closed"))?;
         let turn = connection.turn.lock().await;
         let of_total = connection.of_total.acquire(permits);
         let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await?;

@@ -11,12 +11,15 @@ use tonic::codegen::{BoxFuture, Service};
 use tonic::server::NamedService;
 use tonic::{Code, Status};
 
+use super::authentication::{Authenticator, Denial};
 use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
 use super::reply_budget::CountedReplyBody;
 use super::request_body::{RequestBody, RequestMemory};
-use super::status::{to_status, transport_status};
+use super::revocable_body::{RevocableBody, revoked, revoked_status};
+use super::status::{internal_fault, to_status, transport_status, unknown_method};
 use super::stream::parse_timeout;
+use crate::identity::Credential;
 use modalcast_model::error::Error;
 
 /// Time by which a service may exceed the timeout of a call, so that its own error arrives first.
@@ -24,17 +27,27 @@ const TIMEOUT_MARGIN: Duration = Duration::from_millis(20);
 
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
 
+/// The credential of a call, in the extensions of its request. `None` for a method that requires none.
+#[derive(Clone)]
+struct Caller(Option<Arc<Credential>>);
+
+/// The credential with which a request was admitted.
+pub(super) fn caller<T>(request: &tonic::Request<T>) -> Option<&Arc<Credential>> {
+    request.extensions().get::<Caller>()?.0.as_ref()
+}
+
 /// All services of the server.
 #[derive(Clone)]
 pub(super) struct Routes {
     by_name: Arc<BTreeMap<&'static str, Route>>,
+    authenticator: Arc<Authenticator>,
     max_message_bytes: usize,
 }
 
 impl Routes {
     /// `max_message_bytes` is the limit on the messages that the services accept.
-    pub(super) fn new(max_message_bytes: usize) -> Self {
-        Self { by_name: Arc::default(), max_message_bytes }
+    pub(super) fn new(authenticator: Arc<Authenticator>, max_message_bytes: usize) -> Self {
+        Self { by_name: Arc::default(), authenticator, max_message_bytes }
     }
 
     /// Adds a service.
@@ -64,19 +77,29 @@ fn with_transport_details(response: Response<Body>, max_message_bytes: usize) ->
 }
 
 impl Routes {
-    pub(super) fn call(&self, request: Request<Body>) -> BoxFuture<Response<Body>, Infallible> {
+    /// Calls the service that the path names, if the caller may. The request has the caller's [`Credential`] in its
+    /// extensions, unless the method requires none.
+    pub(super) fn call(&self, mut request: Request<Body>) -> BoxFuture<Response<Body>, Infallible> {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         let Some(route) = self.by_name.get(name).cloned() else {
-            return Box::pin(async {
-                Ok(Status::unimplemented("expected the path of a service of this server").into_http())
-            });
+            return Box::pin(async { Ok(unknown_method().into_http()) });
         };
+        let Some(connection) = request.extensions().get::<ConnectionInfo>().cloned() else {
+            return Box::pin(async { Ok(internal_fault("expected a connection of this server").into_http()) });
+        };
+        let credential = match self.authenticator.admit(request.uri().path(), request.headers(), &connection) {
+            Ok(credential) => credential,
+            Err(Denial { status, delay }) => {
+                return Box::pin(async move {
+                    tokio::time::sleep(delay).await;
+                    Ok(status.into_http())
+                });
+            }
+        };
+        request.extensions_mut().insert(Caller(credential.clone()));
         let timeout = request.headers().get("grpc-timeout");
         let timeout = timeout.and_then(|timeout| parse_timeout(timeout.to_str().ok()?));
-        let response: BoxFuture<_, _> = match request.extensions().get::<ConnectionInfo>().cloned() {
-            Some(connection) => Box::pin(call_within_budgets(route, request, connection)),
-            None => route(request),
-        };
+        let response = Box::pin(call_within_budgets(route, request, connection, credential));
         let max_message_bytes = self.max_message_bytes;
         Box::pin(async move {
             let response = answer_in_time(timeout, response).await?;
@@ -98,11 +121,13 @@ async fn answer_in_time(
     })
 }
 
-/// Calls a service. Request and response count against the budgets of the connection.
+/// Calls a service. Request and response count against the budgets of the connection. The response ends when the
+/// credential is revoked.
 async fn call_within_budgets(
     route: Route,
     request: Request<Body>,
     connection: ConnectionInfo,
+    credential: Option<Arc<Credential>>,
 ) -> Result<Response<Body>, Infallible> {
     let memory = RequestMemory::new(&connection.receive);
     let request_memory = memory.clone();
@@ -110,9 +135,20 @@ async fn call_within_budgets(
     let request_call = Arc::clone(&call);
     let limits = connection.receive.limits();
     let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, limits, request_call)));
-    let response = connection.reply.new_call().scope(route(request)).await;
+    let response = tokio::select! {
+        response = connection.reply.new_call().scope(route(request)) => response,
+        () = revoked(credential.clone()) => return Ok(revoked_status().into_http()),
+    };
     memory.release_complete();
-    response.map(|response| response.map(|inner| Body::new(CountedReplyBody { inner, _call: call })))
+    response.map(|response| {
+        response.map(|inner| {
+            let body = Body::new(CountedReplyBody { inner, _call: call });
+            match credential {
+                Some(credential) => Body::new(RevocableBody::new(body, credential)),
+                None => body,
+            }
+        })
+    })
 }
 
 #[cfg(test)]
@@ -124,10 +160,6 @@ mod tests {
     /// Never answers.
     #[derive(Clone)]
     struct Silent;
-
-    impl NamedService for Silent {
-        const NAME: &'static str = "silent";
-    }
 
     impl Service<Request<Body>> for Silent {
         type Response = Response<Body>;
@@ -145,8 +177,9 @@ mod tests {
 
     #[tokio::test]
     async fn call_ends_at_its_timeout_though_the_service_does_not_answer() {
-        let request = Request::builder().uri("/silent/Call").header("grpc-timeout", "10m");
-        let response = Routes::new(1).with(Silent).call(request.body(Body::empty()).expect("expected a request"));
+        let silent = Silent;
+        let route: Route = Arc::new(move |request| Box::pin(silent.clone().call(request)));
+        let response = answer_in_time(Some(Duration::from_millis(10)), route(Request::new(Body::empty())));
         let response = tokio::time::timeout(crate::hang_guard::HANG_GUARD, response).await.expect("expected an answer");
         let response = response.expect("expected a response");
         let status = Status::from_header_map(response.headers()).expect("expected a status");

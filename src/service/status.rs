@@ -8,7 +8,7 @@ use modalcast_proto::v1::{Reason, Rejection};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-use modalcast_model::error::Error;
+use modalcast_model::error::{Error, fault};
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
 /// headers.
@@ -216,6 +216,28 @@ pub(super) fn transport_status(stream_status: Status, max_message_bytes: usize) 
     let expected = format!("at most {max_message_bytes} bytes");
     ErrorReport::new(Code::ResourceExhausted, Reason::MessageTooLarge, expected, stream_status.message())
         .into_status(stream_status.message().to_owned())
+}
+
+/// The status of a fault of the server itself.
+pub(super) fn internal_fault(reason: impl ToString) -> Status {
+    to_status(fault("call", reason))
+}
+
+/// The status of a call to a method that the server does not have, as gRPC defines it.
+pub(super) fn unknown_method() -> Status {
+    Status::unimplemented("expected the path of a method of this server")
+}
+
+/// The status of a call without a valid credential.
+pub(super) fn unauthenticated(expected: &str, given: &str) -> Status {
+    ErrorReport::new(Code::Unauthenticated, Reason::Unauthenticated, expected, given)
+        .into_status(format!("credential: expected {expected}, got {given}"))
+}
+
+/// The status of a call that its principal may not make.
+pub(super) fn permission_denied(expected: &str, given: &str) -> Status {
+    ErrorReport::new(Code::PermissionDenied, Reason::PermissionDenied, expected, given)
+        .into_status(format!("permission: expected {expected}, got {given}"))
 }
 
 #[cfg(test)]

@@ -46,7 +46,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let session = DriveSession {
             engine: self.engine.clone(),
-            peer: connection.peer(),
+            peer: connection.peer().to_owned(),
             parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits(), memory),
             _drive_permit: drive_permit,
             inbound: request.into_inner(),
@@ -60,7 +60,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         &self,
         request: Request<v1::ResetSceneRequest>,
     ) -> Result<Response<v1::ResetSceneResponse>, Status> {
-        let peer = ConnectionInfo::of(&request).map_err(to_status)?.peer();
+        let peer = ConnectionInfo::of(&request).map_err(to_status)?.peer().to_owned();
         let request = request.into_inner();
         let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
         let step = scene_handle.reset(&peer, request.take_over).await.map_err(to_status)?;

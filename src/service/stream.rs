@@ -16,7 +16,7 @@ use tonic::{Response, Status};
 
 use super::reply_body::{EncodedMessage, PREFIX_BYTES, QueuedMessage, ReplyMessage, with_body};
 use super::reply_budget::{CallReplies, UnsentBytes};
-use super::status::to_status;
+use super::status::{internal_fault, to_status};
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::{Error, Result};
@@ -80,7 +80,7 @@ impl<T: ReplyMessage> WholeReplyPermit<'_, T> {
     pub(super) async fn send(&mut self, message: T) -> Result<(), Status> {
         let slot = self.sender.messages.reserve().await.map_err(|_| disconnected_status())?;
         let message = EncodedMessage::new(message)?;
-        let unsent = self.unsent.split(message.size()).ok_or_else(|| Status::internal("the reply budget is closed"))?;
+        let unsent = self.unsent.split(message.size()).ok_or_else(|| internal_fault("the reply budget is closed"))?;
         slot.send(QueuedMessage { message, unsent });
         Ok(())
     }
@@ -209,7 +209,7 @@ async fn supervise(
     keep_open: mpsc::Sender<QueuedMessage>,
     mut is_closed: oneshot::Receiver<()>,
 ) {
-    let panicked = |_| Err(Status::internal("the call panicked in the server"));
+    let panicked = |_| Err(internal_fault("the call panicked in the server"));
     let end_slow_reader = || {
         *lock(&queue.error) = Some(to_status(replies.slow_reader()));
         queue.clear();
@@ -250,7 +250,7 @@ pub(super) async fn catch_panic<T: Send + 'static>(
     let mut task = CallTask(tokio::spawn(work));
     match (&mut task.0).await {
         Ok(result) => result.map_err(to_status),
-        Err(_) => Err(Status::internal("the call panicked in the server")),
+        Err(_) => Err(internal_fault("the call panicked in the server")),
     }
 }
 

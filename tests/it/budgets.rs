@@ -259,7 +259,17 @@ impl ServerProcess {
         write("scene.toml", &"[[domain]]\nmodel = 'triangle.obj'\n".repeat(DOMAINS))
             .expect("expected a writable folder");
         let mut child = Command::new(env!("CARGO_BIN_EXE_modalcast"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--renderer", "off", "--scenes"])
+            .args([
+                "serve",
+                "--no-auth",
+                "--listen",
+                "127.0.0.1:0",
+                "--backend",
+                "cpu",
+                "--renderer",
+                "off",
+                "--scenes",
+            ])
             .arg(folder.path())
             .arg("--state")
             .arg(folder.path().join("state"))

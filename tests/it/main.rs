@@ -19,6 +19,7 @@ mod far_arrays;
 mod following;
 mod forces;
 mod frames;
+mod identity;
 mod import_cycles;
 mod invalid_input;
 mod kept_calls;

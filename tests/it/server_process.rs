@@ -48,7 +48,17 @@ impl ServerProcess {
         let scenes = folder.join("scenes");
         std::fs::create_dir_all(&scenes).expect("expected a folder");
         let mut process = Command::new(env!("CARGO_BIN_EXE_modalcast"))
-            .args(["serve", "--listen", "127.0.0.1:0", "--backend", "cpu", "--renderer", "software", "--state"])
+            .args([
+                "serve",
+                "--no-auth",
+                "--listen",
+                "127.0.0.1:0",
+                "--backend",
+                "cpu",
+                "--renderer",
+                "software",
+                "--state",
+            ])
             .arg(folder.join("state"))
             .arg("--scenes")
             .arg(scenes)

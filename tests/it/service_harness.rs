@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use modalcast::config::{BackendChoice, Config, ListenAddress, RendererChoice};
+use modalcast::config::{Authentication, BackendChoice, Config, ListenAddress, RendererChoice};
 use modalcast::engine::{Engine, SceneSource, StoredUpload};
 use modalcast::service;
 use modalcast_compute::reference;
@@ -190,6 +190,7 @@ pub(crate) fn config(state: &Path) -> Config {
     Config {
         listen: vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())],
         state: state.to_owned(),
+        authentication: Authentication::Off,
         backend: BackendChoice::Reference,
         renderer: RendererChoice::Off,
         message_bytes: 1 << 20,

@@ -94,6 +94,8 @@ const fn reason_exit_code(reason: Reason) -> u8 {
         | Reason::LimitReached
         | Reason::OutOfMemory
         | Reason::SlowReader
+        | Reason::Unauthenticated
+        | Reason::PermissionDenied
         | Reason::ResourceMissing
         | Reason::ShuttingDown => 5,
         Reason::DeadlineExpired | Reason::DeviceLost | Reason::Internal | Reason::Unspecified => 6,

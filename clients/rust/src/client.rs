@@ -7,13 +7,15 @@ use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
 use prost::Message;
-use tonic::transport::{Channel, Endpoint};
+use tonic::transport::Endpoint;
 use tonic::{Response, Status, Streaming};
 
 use crate::assemble::Replies;
 use crate::error::{Error, Result, describe_causes, malformed_reply};
 use crate::message_stream::{MessageStream, UndecodedChannel};
 use crate::request::Delivery;
+use crate::server_address::{ConnectOptions, ServerAddress};
+use crate::server_channel::ServerChannel;
 use crate::shared_memory::{CallMemory, SharedMemory};
 
 /// The default limit of one reply that is assembled from chunks, in bytes.
@@ -45,9 +47,9 @@ const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 /// A connection to a modalcast server. Streams of every step use a second connection with larger flow-control windows.
 #[derive(Debug, Clone)]
 pub struct Client {
-    pub(crate) channel: Channel,
+    pub(crate) channel: ServerChannel,
     /// A connection with larger windows, which opens with its first stream.
-    lossless_channel: Channel,
+    lossless_channel: ServerChannel,
     pub(crate) max_reply_bytes: u64,
     shared_memory: Option<Arc<SharedMemory>>,
     /// The URL of the server, as the caller passed it, for errors.
@@ -88,17 +90,26 @@ impl ServerInfo {
 
 impl Client {
     /// Connects, with a timeout of five seconds, and checks that the server has the protocol version of this client.
-    /// `url` is `http://host:port`, `host:port`, or `unix:path` for a Unix socket.
+    /// `url` is `http://host:port`, `host:port`, or `unix:path` for a Unix socket. A server of this user on this machine
+    /// is reached at its Unix socket, which needs no token. For others, set a token by [`Self::connect_with`], or the
+    /// environment variable `MODALCAST_TOKEN_FILE` to the path of a file with a token.
     ///
     /// # Errors
     /// `Connect` if the URL is invalid or no server answers; `ProtocolVersion` if the server has another version;
-    /// `Status` if the server is not a modalcast server.
+    /// `Status` if the server is not a modalcast server, or does not know the caller.
     pub async fn connect(url: &str) -> Result<Self> {
+        Self::connect_with(url, &ConnectOptions::default()).await
+    }
+
+    /// Connects as [`Self::connect`], with options.
+    ///
+    /// # Errors
+    /// As for [`Self::connect`].
+    pub async fn connect_with(url: &str, options: &ConnectOptions) -> Result<Self> {
         let connect_error =
             |error: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&error) };
-        let has_scheme = url.contains("://") || url.starts_with("unix:");
-        let url_with_scheme = if has_scheme { url.to_owned() } else { format!("http://{url}") };
-        let endpoint = Endpoint::from_shared(url_with_scheme)
+        let ServerAddress { url: server_url, authorization } = ServerAddress::find(url, options)?;
+        let endpoint = Endpoint::from_shared(server_url)
             .map_err(connect_error)?
             .connect_timeout(CONNECT_TIMEOUT)
             .max_frame_size(MAX_FRAME_SIZE)
@@ -108,9 +119,10 @@ impl Client {
             let endpoint = endpoint.clone().initial_stream_window_size(stream_window);
             endpoint.initial_connection_window_size(STREAMS_PER_CONNECTION_WINDOW * stream_window)
         };
+        let authorized = |channel| ServerChannel { channel, authorization: authorization.clone() };
         let client = Self {
-            channel: with_window(STREAM_WINDOW).connect().await.map_err(connect_error)?,
-            lossless_channel: with_window(LOSSLESS_STREAM_WINDOW).connect_lazy(),
+            channel: authorized(with_window(STREAM_WINDOW).connect().await.map_err(connect_error)?),
+            lossless_channel: authorized(with_window(LOSSLESS_STREAM_WINDOW).connect_lazy()),
             max_reply_bytes: REPLY_LIMIT,
             shared_memory: None,
             url: url.into(),
@@ -249,7 +261,7 @@ impl Client {
         v1::scene_service_client::SceneServiceClient::new(self.undecoded_channel())
     }
 
-    pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<Channel> {
+    pub(crate) fn scenes(&self) -> v1::scene_service_client::SceneServiceClient<ServerChannel> {
         v1::scene_service_client::SceneServiceClient::new(self.channel.clone())
     }
 

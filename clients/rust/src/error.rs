@@ -120,14 +120,12 @@ impl Error {
     }
 }
 
-/// Whether the connection failed. tonic reports a broken connection as `Unknown` or `Unavailable` with a cause; a
-/// status sent by the server has no cause. The server adds details to every `Unavailable`. A status with this code but
-/// without details therefore comes from a proxy that cannot reach the server.
+/// Whether the connection failed. The server adds details to every status. A status without them comes from tonic or
+/// from a proxy: a broken connection is `Unknown`, `Unavailable` or, after a proxy has reset the stream, `Internal`.
 fn is_connection_lost(status: &tonic::Status) -> bool {
-    let has_cause = std::error::Error::source(status).is_some();
+    let is_of_server = !status.details().is_empty();
     match status.code() {
-        tonic::Code::Unknown => has_cause,
-        tonic::Code::Unavailable => has_cause || status.details().is_empty(),
+        tonic::Code::Unknown | tonic::Code::Internal | tonic::Code::Unavailable => !is_of_server,
         _ => false,
     }
 }
@@ -166,5 +164,22 @@ mod tests {
         let invalid_details = tonic::Status::with_details(tonic::Code::Internal, "no", vec![0xff; 3].into());
         assert_eq!(Error::from_status(invalid_details, "server:1").rejection(), None);
         assert_eq!(Error::from_status(tonic::Status::not_found("scene"), "server:1").rejection(), None);
+    }
+
+    /// A proxy ends streams with `INTERNAL` when it resets them.
+    #[test]
+    fn only_transport_errors_without_details_are_a_lost_connection() {
+        use tonic::Code;
+        let is_lost = |status| matches!(Error::from_status(status, "server:1"), Error::Connect { .. });
+        let lost = [Code::Unavailable, Code::Unknown, Code::Internal];
+        for code in lost {
+            assert!(is_lost(tonic::Status::new(code, "reset")), "{code:?}");
+            let details = ErrorDetails::with_error_info("REASON_INTERNAL", "modalcast", HashMap::new());
+            assert!(!is_lost(tonic::Status::with_error_details(code, "fault", details)), "{code:?}");
+        }
+        // Local deadlines, cancellations and size limits.
+        for code in [Code::DeadlineExceeded, Code::Cancelled, Code::OutOfRange, Code::ResourceExhausted] {
+            assert!(!is_lost(tonic::Status::new(code, "local")), "{code:?}");
+        }
     }
 }

@@ -17,6 +17,8 @@ mod pick;
 pub mod program;
 mod request;
 mod scene;
+mod server_address;
+mod server_channel;
 mod shared_memory;
 mod stages;
 mod state_packing;
@@ -47,6 +49,7 @@ pub use scene::{
     AlphaMode, Attachment, Domain, Follow, Inertia, Material, MaterialRange, SceneDescription, Shape, ShapeArray,
     Texture,
 };
+pub use server_address::ConnectOptions;
 pub use stages::{StageSamples, StageTimes};
 pub use states::{
     SceneState, SentValues, StateDecoder, StateLayout, StateRequest, StateStream, StateStreamOptions,

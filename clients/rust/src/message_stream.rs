@@ -15,8 +15,9 @@ use prost::Message;
 use tonic::body::Body;
 use tonic::codegen::http::{HeaderMap, Request, Response, StatusCode};
 use tonic::codegen::{Body as _, BoxFuture, Service};
-use tonic::transport::Channel;
 use tonic::{Status, Streaming};
+
+use crate::server_channel::ServerChannel;
 
 /// Size of the prefix of a message: a flag (0: not compressed) and the length of the message as u32.
 const PREFIX_BYTES: usize = 5;
@@ -26,7 +27,7 @@ const MAX_MESSAGE_BYTES: usize = 4 << 20;
 
 /// A connection for generated clients whose replies are read by a [`MessageStream`].
 #[derive(Debug, Clone)]
-pub(crate) struct UndecodedChannel(pub(crate) Channel);
+pub(crate) struct UndecodedChannel(pub(crate) ServerChannel);
 
 impl Service<Request<Body>> for UndecodedChannel {
     type Response = Response<Body>;

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use modalcast::config::{BackendChoice, Config, ListenAddress, RendererChoice};
+use modalcast::config::{Authentication, BackendChoice, Config, ListenAddress, RendererChoice};
 use modalcast::engine::Engine;
 use modalcast::service;
 use modalcast_model::load::SceneRepository;
@@ -188,6 +188,7 @@ fn rejection_of(status: &Status) -> v1::Rejection {
 async fn start_server(state: &Path) -> (Engine, Channel) {
     let config = Config {
         listen: vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())],
+        authentication: Authentication::Off,
         viewer: false,
         state: state.to_owned(),
         backend: BackendChoice::Cpu,

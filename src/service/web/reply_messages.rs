@@ -9,6 +9,8 @@ use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::http::Response;
 
+use super::super::status::internal_fault;
+
 /// Size of the prefix of a gRPC message: a flag (0: not compressed) and the length of the message as u32.
 const PREFIX_BYTES: usize = 5;
 
@@ -66,7 +68,7 @@ impl ReplyMessages {
         let status = self.status.take();
         match status {
             Some(status) if self.data.bytes == 0 => status,
-            _ => Status::internal("expected complete messages and a status, got the end of the reply"),
+            _ => internal_fault("expected complete messages and a status, got the end of the reply"),
         }
     }
 }
@@ -97,7 +99,7 @@ impl PieceQueue {
             }
             let [flag, length @ ..] = prefix;
             if flag != 0 {
-                return Err(Status::internal("expected a message without compression"));
+                return Err(internal_fault("expected a message without compression"));
             }
             self.message_bytes = Some(u32::from_be_bytes(length) as usize);
         }

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import functools
 import os
+import socket
+import stat
+from dataclasses import dataclass
+from pathlib import Path
 
 # Bytes. The server sends messages of at most 3 MiB.
 _MAX_MESSAGE_BYTES = 4 << 20
@@ -66,6 +70,70 @@ def target_of(address: str) -> str:
     if not target:
         raise ValueError("address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got an empty text")
     return target if ":" in target else f"{target}:50051"
+
+
+@dataclass(frozen=True, repr=False)
+class Route:
+    """The way to a server.
+
+    Attributes:
+        target: The target of connections.
+        metadata: Sent with every call: the token, if there is one.
+    """
+
+    target: str
+    metadata: tuple[tuple[str, str], ...] = ()
+
+
+def route_to(address: str, token: str | None) -> Route:
+    """The way to the server at an address.
+
+    Without a token, a server of this user on this machine is reached at its Unix socket, where the user is the
+    credential. The environment variable MODALCAST_TOKEN_FILE names a file with a token.
+
+    Raises:
+        ValueError: The address or the token is invalid.
+        OSError: The file of the token cannot be read.
+    """
+    target = target_of(address)
+    path = os.environ.get("MODALCAST_TOKEN_FILE")
+    if token is None and path and not target.startswith("unix:"):
+        token = Path(path).read_text().strip()
+    if token is None:
+        path = _local_socket(target)
+        return Route(target if path is None else f"unix:{path}")
+    if not (token.isascii() and token.isprintable() and token and " " not in token):
+        raise ValueError("token: expected visible ASCII letters, got another text")
+    return Route(target, (("authorization", f"Bearer {token}"),))
+
+
+def _local_socket(target: str) -> Path | None:
+    """The socket of a running server of this user at HOST:PORT. Others cannot create one in a folder of this user."""
+    host, _, port = target.rpartition(":")
+    if host not in ("localhost", "[::1]") and not host.startswith("127."):
+        return None
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state")
+    folder = Path(runtime) / "modalcast" if runtime else state / "modalcast/run"
+    path = folder / f"{port}.sock"
+    try:
+        of_folder, of_socket = folder.lstat(), path.lstat()
+    except OSError:
+        return None
+    is_private = stat.S_ISDIR(of_folder.st_mode) and of_folder.st_mode & 0o022 == 0
+    is_own = is_private and of_folder.st_uid == of_socket.st_uid and stat.S_ISSOCK(of_socket.st_mode)
+    return path if is_own and _is_answered(path) else None
+
+
+def _is_answered(path: Path) -> bool:
+    """Whether a server listens on a socket. A killed server leaves its socket."""
+    with socket.socket(socket.AF_UNIX) as connection:
+        connection.settimeout(5.0)
+        try:
+            connection.connect(str(path))
+        except OSError:
+            return False
+    return True
 
 
 def deadline_ms(timeout: float) -> int:

@@ -61,6 +61,10 @@ class ServerProcess:
             raise ServerStartError(f"the server ended with exit code {self._process.returncode}: {self.log()}")
         return None
 
+    def token(self) -> str:
+        """The token of the server, once it listens."""
+        return (Path(self._folder.name) / "state/token").read_text().strip()
+
     def log(self) -> str:
         """The last 2000 characters that the server has logged."""
         return self._log.read_text(errors="replace")[-2000:].strip() if self._log.exists() else ""

@@ -116,6 +116,14 @@ class LeaseLost(ServerError):
     """Another writer has taken over the scene."""
 
 
+class Unauthenticated(ServerError):
+    """The server does not know the caller: a token is missing, wrong, or no longer valid."""
+
+
+class PermissionDenied(ServerError, PermissionError):
+    """The role of the caller does not permit the call."""
+
+
 class InternalError(ServerError):
     """The server, a library or the device failed."""
 
@@ -130,6 +138,8 @@ _CLASS_OF_CODE: dict[str, type[ServerError]] = {
     "DEADLINE_EXCEEDED": DeadlineExceeded,
     "UNAVAILABLE": Unavailable,
     "ABORTED": LeaseLost,
+    "UNAUTHENTICATED": Unauthenticated,
+    "PERMISSION_DENIED": PermissionDenied,
     "INTERNAL": InternalError,
 }
 
@@ -172,8 +182,9 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> Error:
     code, message = status.code().name, status.details() or ""
     details = _status_details(status)
     if details is None:
-        # The server adds details to every status. A status without them comes from gRPC itself or from a proxy.
-        if code in ("UNAVAILABLE", "UNKNOWN"):
+        # The server adds details to every status. A status without them comes from gRPC itself or from a proxy, which
+        # ends streams with INTERNAL.
+        if code in ("UNAVAILABLE", "UNKNOWN", "INTERNAL"):
             return ConnectionLost(f"{address}: no connection: {message}")
         return _CLASS_OF_CODE.get(code, ServerError)(f"{address}: {message} ({code})", code=code)
     info, field, retry_after = details

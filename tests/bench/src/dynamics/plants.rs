@@ -11,7 +11,7 @@ use serde::Serialize;
 use super::plant_files::{DOMAINS_PER_SHOOT, write_plant};
 use crate::timing::quantile;
 use crate::workloads::Size;
-use modalcast::config::{BackendChoice, Config, ListenAddress, RendererChoice};
+use modalcast::config::{Authentication, BackendChoice, Config, ListenAddress, RendererChoice};
 use modalcast::engine::Engine;
 use modalcast::service;
 use modalcast_client::Client;
@@ -102,6 +102,7 @@ fn fetch_model(folder: &Path, source: &str) -> DynamicsResult<Model> {
 /// Starts a server that ends with the runtime. Returns its address.
 async fn serve(folder: &Path, state: &Path) -> modalcast_model::error::Result<String> {
     let config = Config {
+        authentication: Authentication::Off,
         listen: vec![ListenAddress::Tcp(([127, 0, 0, 1], 0).into())],
         state: state.to_owned(),
         backend: BackendChoice::Cpu,

@@ -268,7 +268,8 @@ fn start_server(work: &Path, repository: Option<&Path>, draws: bool, backend: Se
     let state = work.join("state");
     let unix_address = format!("unix:{}", unix_socket(work).display());
     let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--listen", &unix_address, &"--state", &state]);
-    list.extend(arguments([&"--shared-memory", &shared_memory_socket(work)]));
+    // With authentication, the clients of this report would use the Unix socket in place of TCP.
+    list.extend(arguments([&"--no-auth", &"--shared-memory", &shared_memory_socket(work)]));
     if let Some(repository) = repository {
         list.extend(arguments([&"--scenes", &repository]));
     }

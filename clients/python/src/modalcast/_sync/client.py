@@ -322,13 +322,24 @@ class RecordedErrors(Iterator[RequestT]):
 
 
 def connect(
-    address: str | None = None, *, timeout: float = 60.0, reconnect: float = 10.0, connect_timeout: float = 5.0
+    address: str | None = None,
+    *,
+    token: str | None = None,
+    timeout: float = 60.0,
+    reconnect: float = 10.0,
+    connect_timeout: float = 5.0,
 ) -> Client:
     """Connects to a server.
+
+    A server that you have started on this machine needs no token: it is reached at its Unix socket, and the kernel
+    tells it who you are. Other servers need one.
 
     Args:
         address: HOST:PORT, http://HOST:PORT or unix:PATH; None: the environment variable MODALCAST_SERVER, or
             127.0.0.1:50051.
+        token: Identifies you to the server; None: the token in the file that the environment variable
+            MODALCAST_TOKEN_FILE names, if any. Anyone on the way can read it, unless the connection stays on this
+            machine or goes through a tunnel.
         timeout: Default time limit of a call, in seconds.
         reconnect: Seconds for which calls without side effects, streams of the latest steps and drives wait for the
             server after a lost connection; 0: they raise `ConnectionLost` at once.
@@ -336,10 +347,11 @@ def connect(
 
     Raises:
         ConnectionLost: No server answers.
+        Unauthenticated: The server does not know you.
         ProtocolVersionError: The server has another version of the contract.
-        ValueError: The address is invalid.
+        ValueError: The address or the token is invalid.
     """
-    transport = Transport(default_address() if address is None else address)
+    transport = Transport(default_address() if address is None else address, token)
     client = Client(transport, timeout=timeout, reconnect=reconnect, server=None)
     try:
         client.check_version(connect_timeout)
@@ -380,7 +392,7 @@ def spawn(
                 raise ServerStartError(f"the server did not listen within {start_timeout:g} s: {server.log()}")
             sleep(RETRY_SECONDS)
             waited += RETRY_SECONDS
-        transport = Transport(address)
+        transport = Transport(address, server.token())
         client = Client(transport, timeout=timeout, reconnect=0.0, server=server)
         client.check_version(timeout)
     except BaseException:

@@ -12,7 +12,7 @@ import grpc
 from google.protobuf.message import Message
 from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTypeStubs]
 
-from modalcast._channel import keep_memory_of_messages, options_of, target_of
+from modalcast._channel import keep_memory_of_messages, options_of, route_to
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
@@ -208,14 +208,15 @@ class Transport:
     Subscriptions that are not read fill the flow-control window of their connection, but not that of calls.
     """
 
-    def __init__(self, address: str) -> None:
-        """Connects with the first call.
+    def __init__(self, address: str, token: str | None) -> None:
+        """Connects with the first call, and sends the token with every call.
 
         Raises:
-            ValueError: The address is invalid.
+            ValueError: The address or the token is invalid.
+            OSError: The file of the token cannot be read.
         """
         self.address = address
-        self._target = target_of(address)
+        self._route = route_to(address, token)
         keep_memory_of_messages()
         self._channel = self._new_channel()
         self._subscriptions: grpc.Channel | None = None
@@ -228,7 +229,7 @@ class Transport:
         """
         call = self._channel.unary_unary(method.path, method.request.SerializeToString, method.reply.FromString)
         try:
-            return call(request, timeout=timeout)
+            return call(request, timeout=timeout, metadata=self._route.metadata)
         except grpc.RpcError as error:
             raise from_rpc_error(error, self.address) from None
 
@@ -246,7 +247,7 @@ class Transport:
             # fails if it was sent on a connection that is being lost.
             remaining = max(end - time.monotonic(), RETRY_SECONDS)
             try:
-                call(method.request(), timeout=remaining, wait_for_ready=True)
+                call(method.request(), timeout=remaining, wait_for_ready=True, metadata=self._route.metadata)
             except grpc.RpcError:
                 if time.monotonic() + RETRY_SECONDS >= end:
                     raise ConnectionLost(f"{self.address}: no connection for {timeout:g} s") from None
@@ -262,7 +263,7 @@ class Transport:
         """
         call = self._channel.stream_unary(method.path, method.request.SerializeToString, method.reply.FromString)
         try:
-            return call(requests, timeout=timeout)
+            return call(requests, timeout=timeout, metadata=self._route.metadata)
         except grpc.RpcError as error:
             raise from_rpc_error(error, self.address) from None
 
@@ -284,7 +285,8 @@ class Transport:
         method = DRIVE_SCENE
         # The requests are encoded already.
         call = cast(Any, self._channel.stream_stream(method.path, None, method.reply.FromString))
-        return StepStream(call, self.address)
+        metadata = self._route.metadata
+        return StepStream(lambda requests: call(requests, metadata=metadata), self.address)
 
     def close(self) -> None:
         """Closes the connections, and ends all calls."""
@@ -302,13 +304,15 @@ class Transport:
         wait_for_ready: bool = False,
     ) -> ReplyStream:
         call = cast(Any, channel.unary_stream(method.path, method.request.SerializeToString))
-        return ReplyStream(call(request, timeout=timeout, wait_for_ready=wait_for_ready), self.address)
+        metadata = self._route.metadata
+        started = call(request, timeout=timeout, wait_for_ready=wait_for_ready, metadata=metadata)
+        return ReplyStream(started, self.address)
 
     def _new_channel(self) -> grpc.Channel:
         # With this option, the calling thread reads the replies of a call, without a thread per call. A cancelled call
         # then keeps its connection open. Subscriptions are cancelled often, so their channel has no such option.
         single_threaded = (ChannelOptions.SingleThreadedUnaryStream, 1)
-        return grpc.insecure_channel(self._target, options=[*options_of(self._target), single_threaded])
+        return grpc.insecure_channel(self._route.target, options=[*options_of(self._route.target), single_threaded])
 
     def _new_subscription_channel(self) -> grpc.Channel:
-        return grpc.insecure_channel(self._target, options=options_of(self._target))
+        return grpc.insecure_channel(self._route.target, options=options_of(self._route.target))

@@ -29,6 +29,8 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_STREAM_NOT_FOUND: _ClassVar[Reason]
     REASON_CONTENT_NOT_FOUND: _ClassVar[Reason]
     REASON_OUT_OF_MEMORY: _ClassVar[Reason]
+    REASON_UNAUTHENTICATED: _ClassVar[Reason]
+    REASON_PERMISSION_DENIED: _ClassVar[Reason]
 REASON_UNSPECIFIED: Reason
 REASON_INVALID_FIELD: Reason
 REASON_UNEXPECTED_MESSAGE: Reason
@@ -51,6 +53,8 @@ REASON_LEASE_LOST: Reason
 REASON_STREAM_NOT_FOUND: Reason
 REASON_CONTENT_NOT_FOUND: Reason
 REASON_OUT_OF_MEMORY: Reason
+REASON_UNAUTHENTICATED: Reason
+REASON_PERMISSION_DENIED: Reason
 
 class Rejection(_message.Message):
     __slots__ = ("step", "reason", "field", "expected", "given")

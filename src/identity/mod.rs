@@ -1,0 +1,16 @@
+//! Who may do what: principals, their credentials and their roles.
+//!
+//! # Threat model
+//! Trusted are the user of the server, root, and users of the GPU device, who can read its memory. Not trusted are other
+//! accounts of the machine, web pages, the network, and other principals of the server beyond their roles.
+
+mod directory;
+mod principal;
+mod principals_file;
+mod role;
+mod token;
+
+pub use directory::Directory;
+pub use principal::{Credential, OWNER, Principal};
+pub use role::Role;
+pub use token::{TokenHash, new_token};
