@@ -218,7 +218,8 @@ pub(crate) struct WindOptions {
     /// Mean speed of the wind at the crown in m/s: 4 moves leaves and twigs, 8 small branches, 20 breaks branches. The
     /// drag on all surfaces is proportional to the square of the speed. The wind has the spectrum of turbulence above
     /// suburbs or forest, and begins with its strongest gust. Default: 0 for a single body; if domains are attached to
-    /// each other, at most 8, and less if its gusts would move a part by more than 0.3 of the height at rest.
+    /// each other, at most 8, and less if its gusts would move a part by more than 0.3 of the height, or bend one by
+    /// more than 0.3 of its size, at rest.
     #[arg(long = "wind", value_name = "SPEED", value_parser = parse_non_negative)]
     pub(crate) speed: Option<f64>,
     /// Direction that the wind blows to, in degrees about the up axis from x (from y if x is up). At 25, the

@@ -7,21 +7,21 @@ mod excitation;
 #[cfg(test)]
 mod tests;
 
-use nalgebra::{DVector, Vector6};
+use nalgebra::{DVector, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::affine::AffineTransform;
 use crate::attachments::Attachments;
 use crate::checkpoint::RunIdentity;
-use crate::coupled::{CoupledModes, StaticSystem};
+use crate::coupled::{CoupledModes, StaticResponse, StaticSystem};
 use crate::displacement_meter::DisplacementMeter;
 use crate::error::{Result, check_option, invalid_input};
 use crate::hierarchy::compose_transforms;
 use crate::integrator::{Integrator, LoadChange, ModalOscillators, MotionState, nyquist_remark};
 use crate::joint_gap::JointGapMeter;
 use crate::loads::DomainLoads;
-use crate::model::{DomainModel, Model};
+use crate::model::{DomainModel, Model, Sample};
 use crate::parameters::ModalParameters;
 use crate::run::{Report, Scenario};
 use crate::saved_state::{check_vector, from_json, number_bits, to_json, vector_bits};
@@ -35,9 +35,10 @@ use excitation::{WindExcitation, WindOptions};
 /// Largest mean speed that [`default_wind_speed`] returns, in m/s: a fresh breeze, in which small trees sway.
 const MAX_DEFAULT_SPEED: f64 = 8.0;
 
-/// Displacement at rest in the gusts of the default wind, as a fraction of the scene's height. It is that
-/// of the most flexible leaf or twig, and several times that of the crown.
-const DEFAULT_DISPLACEMENT: f64 = 0.3;
+/// Limit at rest in the gusts of the default wind: on displacements as a fraction of the scene's height, and on the
+/// deflections of each part as a fraction of the part's size. The most flexible leaf or twig reaches it, and the crown a
+/// fraction of it.
+const DEFAULT_DEFLECTION: f64 = 0.3;
 
 /// Settings of the tree scenario.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -324,8 +325,9 @@ fn check_wind_moves(model: &Model, excitation: &WindExcitation, statics: &Static
 }
 
 /// The mean speed of a wind that linear modes can show, in m/s: at most 8. The pressure of its gusts displaces no
-/// surface sample by more than 0.3 of the scene's height at rest. Linear modes have no limit of their own:
-/// in a stronger wind they lengthen twigs and leaves, which real ones avoid by bending away and by shelter.
+/// surface sample by more than 0.3 of the scene's height at rest, and bends no domain by more than 0.3 of its own size.
+/// Linear modes have no limit of their own: in a stronger wind they lengthen twigs and leaves, which real ones avoid by
+/// bending away and by shelter.
 ///
 /// # Errors
 /// Those of [`StaticSystem::new`] and [`ModalParameters::read`].
@@ -334,19 +336,29 @@ pub fn default_wind_speed(model: &Model, direction_radians: f64) -> Result<f64> 
     let wind = WindOptions { mean_speed: MAX_DEFAULT_SPEED, direction_radians, seed: 0, max_frequency: 0.0 };
     let excitation = WindExcitation::new(model, &wind);
     let response = statics.solve(&excitation.steady_loads(model, Wind::gust_pressure(MAX_DEFAULT_SPEED)));
-    let displacement_of = |(index, domain): (usize, &DomainModel)| {
-        let samples = domain.surface_samples().iter();
-        samples.map(|sample| response.displacement(model, index, sample).norm()).fold(0.0, f64::max)
-    };
-    let displacement = model.domains.iter().enumerate().map(displacement_of).fold(0.0, f64::max);
-    let limit = DEFAULT_DISPLACEMENT * model.height();
-    if displacement <= limit {
+    let deflection = largest_deflection(model, &response);
+    if deflection <= DEFAULT_DEFLECTION {
         return Ok(MAX_DEFAULT_SPEED);
     }
     // The drag goes as the square of the speed. Two digits are enough, and are rounded down.
-    let speed = MAX_DEFAULT_SPEED * (limit / displacement).sqrt();
+    let speed = MAX_DEFAULT_SPEED * (DEFAULT_DEFLECTION / deflection).sqrt();
     let digits_per_unit = 10_f64.powf(1.0 - speed.log10().floor());
     Ok((speed * digits_per_unit).floor() / digits_per_unit)
+}
+
+/// The largest displacement as a fraction of the scene's height, or deflection of a domain as a fraction of the diagonal of
+/// its samples, whichever is larger.
+fn largest_deflection(model: &Model, response: &StaticResponse) -> f64 {
+    let of_domain = |(index, domain): (usize, &DomainModel)| {
+        let samples = domain.surface_samples();
+        let largest = |length: &dyn Fn(&Sample) -> f64| samples.iter().map(length).fold(0.0, f64::max);
+        let displacement = largest(&|sample| response.displacement(model, index, sample).norm());
+        let deflection = largest(&|sample| sample.displacement(domain.q(&response.q)).norm());
+        let low = samples.iter().fold(Vector3::repeat(f64::MAX), |low, sample| low.inf(&sample.rest_position));
+        let high = samples.iter().fold(Vector3::repeat(f64::MIN), |high, sample| high.sup(&sample.rest_position));
+        (displacement / model.height()).max(if deflection > 0.0 { deflection / (high - low).norm() } else { 0.0 })
+    };
+    model.domains.iter().enumerate().map(of_domain).fold(0.0, f64::max)
 }
 
 /// Remarks on held modes and omitted gusts.
