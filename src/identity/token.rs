@@ -17,7 +17,7 @@ const TOKEN_BYTES: usize = 32;
 const MAX_TOKEN_CHARS: usize = 512;
 
 /// The SHA-256 of a token. Tables of tokens are searched by it: the time of a search reveals nothing about a token,
-/// because nobody can choose a token by its hash.
+/// because a token cannot be chosen by its hash.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TokenHash([u8; 32]);
 

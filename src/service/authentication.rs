@@ -15,7 +15,7 @@ use crate::identity::{Credential, Directory};
 use modalcast_model::error::Result;
 
 /// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
-/// delayed, so nobody can lock out others by wrong ones.
+/// delayed, so wrong ones do not lock out other clients.
 const WRONG_TOKEN_DELAY: Duration = Duration::from_millis(500);
 
 /// Shortest time between two log records of rejected calls.

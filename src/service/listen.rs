@@ -16,7 +16,7 @@ use super::authentication::Authenticator;
 use crate::config::{Config, ListenAddress, ViewerToken};
 use modalcast_model::error::{Error, Result};
 
-/// Bound sockets, and what is needed to admit their clients. Dropping it removes the files of the Unix sockets.
+/// Bound sockets, and the credentials of their clients. Dropping it removes the files of the Unix sockets.
 #[derive(Debug)]
 pub struct Listener {
     pub(super) sockets: ListeningSockets,

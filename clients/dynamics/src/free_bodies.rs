@@ -312,7 +312,7 @@ impl Scenario for FreeScenario {
                 "radians_per_second": rigid.angular_velocity().norm(),
             })
         };
-        // A long list helps nobody.
+        // The report lists the first bodies only, so that it stays readable.
         let bodies: Vec<Value> = (0..self.modes.body_count().min(MAX_REPORTED_BODIES)).map(describe).collect();
         Report::from_iter([
             ("load".to_owned(), json!(load)),
