@@ -191,7 +191,7 @@ pub enum Reason {
     OutOfMemory = 21,
     /// UNAUTHENTICATED: the call has no credential that the server knows, or its credential has been revoked.
     Unauthenticated = 22,
-    /// PERMISSION_DENIED: the role of the caller does not permit the call.
+    /// PERMISSION_DENIED: the role of the caller does not permit the call, or the scene belongs to another principal.
     PermissionDenied = 23,
 }
 impl Reason {
@@ -322,6 +322,12 @@ pub struct SceneInfo {
     /// The newest step that survives a crash of the server and a power loss; unset before the first one.
     #[prost(message, optional, tag = "16")]
     pub durable_step: ::core::option::Option<StepId>,
+    /// Name of the principal that the scene belongs to.
+    #[prost(string, tag = "17")]
+    pub owner: ::prost::alloc::string::String,
+    /// Names of the principals with whom it is shared, or "\*" for all.
+    #[prost(string, repeated, tag = "18")]
+    pub shared_with: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 /// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml.
 /// Each vector has three numbers; colors are linear.
@@ -559,6 +565,22 @@ pub struct DeleteSceneRequest {
 }
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeleteSceneResponse {}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ShareSceneRequest {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// Names of principals, at most 256, or "\*" for all; empty: the scene is no longer shared. Streams of
+    /// principals that lose the scene end with REASON_SCENE_NOT_FOUND.
+    #[prost(string, repeated, tag = "2")]
+    pub principals: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ShareSceneResponse {
+    #[prost(string, tag = "1")]
+    pub owner: ::prost::alloc::string::String,
+    #[prost(string, repeated, tag = "2")]
+    pub shared_with: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DescribeSceneRequest {
     #[prost(string, tag = "1")]
@@ -1024,6 +1046,12 @@ pub mod scene_service_client {
     /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
     /// connection.
     ///
+    /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
+    /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
+    /// permits, except that DeleteScene, ResetScene, ShareScene, OpenDrive.take_over and streams with DELIVERY_LOSSLESS need
+    /// the owner (REASON_PERMISSION_DENIED). Names are common to all principals: a name that another principal's scene has is
+    /// taken.
+    ///
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
     /// planes are in scene units. Three kinds of values are in meters: the positions of origins in the world
@@ -1272,6 +1300,31 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.SceneService", "DeleteScene"));
             self.inner.unary(req, path, codec).await
         }
+        /// Replaces the principals with whom a scene is shared.
+        pub async fn share_scene(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ShareSceneRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ShareSceneResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.SceneService/ShareScene",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.SceneService", "ShareScene"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Describes a scene: one `scene` part, then the `shapes`, `materials`, `textures` and `domains` parts in this order,
         /// then `chunk` parts with the requested arrays. A list may be split into several parts; an empty list has none.
         pub async fn describe_scene(
@@ -1416,6 +1469,14 @@ pub mod scene_service_server {
             tonic::Response<super::DeleteSceneResponse>,
             tonic::Status,
         >;
+        /// Replaces the principals with whom a scene is shared.
+        async fn share_scene(
+            &self,
+            request: tonic::Request<super::ShareSceneRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ShareSceneResponse>,
+            tonic::Status,
+        >;
         /// Server streaming response type for the DescribeScene method.
         type DescribeSceneStream: tonic::codegen::tokio_stream::Stream<
                 Item = std::result::Result<super::DescribeSceneResponse, tonic::Status>,
@@ -1463,6 +1524,12 @@ pub mod scene_service_server {
     /// A new scene and its files count to a client (Limits.client_scenes, Limits.client_upload_bytes): to the lease token of 16
     /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
     /// connection.
+    ///
+    /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
+    /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
+    /// permits, except that DeleteScene, ResetScene, ShareScene, OpenDrive.take_over and streams with DELIVERY_LOSSLESS need
+    /// the owner (REASON_PERMISSION_DENIED). Names are common to all principals: a name that another principal's scene has is
+    /// taken.
     ///
     /// Units of lengths, for all files of this package: a length is in scene units, of which each is SceneInfo.unit meters,
     /// unless the comment of its field says meters. Positions, translations, displacements u = U q, bounds, cameras and clip
@@ -1808,6 +1875,51 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DeleteSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.SceneService/ShareScene" => {
+                    #[allow(non_camel_case_types)]
+                    struct ShareSceneSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::ShareSceneRequest>
+                    for ShareSceneSvc<T> {
+                        type Response = super::ShareSceneResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ShareSceneRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::share_scene(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ShareSceneSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

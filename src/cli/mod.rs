@@ -174,6 +174,7 @@ fn exit_code(error: &Error) -> u8 {
         Error::Invalid { .. } | Error::InvalidFile { .. } | Error::UnexpectedMessage { .. } => 3,
         Error::NotFound { .. } | Error::ContentNotFound { .. } | Error::StreamNotFound | Error::StepPassed { .. } => 4,
         Error::NameTaken { .. }
+        | Error::NotPermitted { .. }
         | Error::LeaseTaken { .. }
         | Error::LeaseLost { .. }
         | Error::WindowFull { .. }

@@ -43,7 +43,7 @@ impl PhysicsProcess {
     pub(super) async fn supervise(mut self, engine: Engine, scene: String, stopped: oneshot::Receiver<()>) {
         tokio::select! {
             message = self.wait_for_end() => {
-                if let Ok(scene_handle) = engine.find_opened(&scene).await {
+                if let Ok(scene_handle) = engine.find(&scene) {
                     scene_handle.set_receiver_error(&message);
                 }
             }

@@ -16,6 +16,7 @@ use super::{Completion, Outcome, print_line, recording};
 use crate::config::{
     BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording, default_local_sockets,
 };
+use crate::identity::Principal;
 use crate::service::{self, Listener};
 use modalcast_model::error::{Result, fault, fault_in, invalid};
 use modalcast_model::load::{self, LoadOptions};
@@ -195,7 +196,7 @@ async fn view(
     let mut signals = TerminationSignals::install()?;
     let open = async {
         let (engine, listener) = start(config).await?;
-        let scene = engine.open(&location.source, "", None).await?;
+        let scene = engine.open(&location.source, "", &Principal::owner(), None).await?;
         Ok((engine, listener, scene.name.clone(), location.force_files(&scene.scene)))
     };
     let (engine, listener, scene, force_files) = tokio::select! {

@@ -51,7 +51,7 @@ fn server_with_fault() {
     let loss = runtime.block_on(async {
         let engine = start_engine(state.as_ref()).await;
         for (name, q) in [("control", 0.25), ("faulty", q)] {
-            let scene = engine.open("strips", name, None).await.expect("expected an open scene");
+            let scene = engine.open("strips", name, &Principal::owner(), None).await.expect("expected an open scene");
             tokio::spawn(send_steps(scene, q));
         }
         tokio::time::timeout(HANG_GUARD, engine.device_lost()).await
@@ -73,7 +73,7 @@ fn run_server(state: &Path, fault: InjectedFault) -> Output {
 
 /// The names of the open scenes, and the failed ones with their errors.
 fn list(engine: &Engine) -> (Vec<String>, Vec<(String, String)>) {
-    let SceneList { open, failed, .. } = engine.list();
+    let SceneList { open, failed, .. } = engine.list(&Principal::owner());
     let failed = failed.into_iter().map(|failed| (failed.name, failed.error.to_string()));
     (open.iter().map(|scene| scene.name.clone()).collect(), failed.collect())
 }
@@ -104,7 +104,7 @@ async fn check_set_aside(fault: InjectedFault, cause: &str) {
         engine.shutdown().await;
     }
     let engine = start_engine(folder.path()).await;
-    engine.open("", "faulty", None).await.expect("expected an open scene");
+    engine.open("", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
     assert_eq!(list(&engine), both_open(), "{fault:?}: expected the opened scene");
     engine.shutdown().await;
     let engine = start_engine(folder.path()).await;
@@ -146,7 +146,7 @@ async fn deleted_scene_leaves_no_crashes() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
     run_server(folder.path(), InjectedFault::Abort);
     let engine = start_engine(folder.path()).await;
-    engine.close("faulty").await.expect("expected a deleted scene");
+    engine.close("faulty", &Principal::owner()).await.expect("expected a deleted scene");
     engine.shutdown().await;
     run_server(folder.path(), InjectedFault::Abort);
     let engine = start_engine(folder.path()).await;
@@ -160,7 +160,7 @@ async fn damaged_crash_log_is_ignored() {
     for damage in [&b"\xff\xfe"[..], b"modalcast crashes 2\n", b"modalcast crashes 1\ncrash SIGABRT faulty\n"] {
         std::fs::write(folder.path().join("crashes"), damage).expect("expected a written file");
         let engine = start_engine(folder.path()).await;
-        engine.open("strips", "faulty", None).await.expect("expected an open scene");
+        engine.open("strips", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
         engine.shutdown().await;
     }
     // The server records crashes again.

@@ -73,6 +73,7 @@ pub use scene::subscriber::Subscription;
 pub use source::{SceneSource, StoredUpload};
 pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
 pub use storage::provenance::{SceneProvenance, validate_scene_name};
+pub use storage::scene_record::{EVERYONE, SceneAccess, SceneRight};
 pub use storage::upload::{Upload, UploadHeader};
 pub use upload_quota::ClientId;
 
@@ -100,9 +101,11 @@ use self::storage::crash_log::CrashLog;
 use self::storage::file_system::{DiskFileSystem, FileSystem};
 use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
+use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_quota::{UploadPermit, UploadQuota};
 use crate::config::{Config, ValidatedConfig};
+use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
 
 /// Handle to the engine. A clone is shallow: all clones share one device thread and one set of scenes.
@@ -153,7 +156,7 @@ impl Engine {
     ) -> Result<(Self, modalcast_model::scene::RawStepUpdate)> {
         let open = || DeviceContext::with_deformer(testing::FaultyDeformer::boxed);
         let engine = Self::start_with_device(Arc::new(config), Arc::new(testing::StripsSource), open).await?;
-        engine.open("strips", "strips", None).await?;
+        engine.open("strips", "strips", &Principal::owner(), None).await?;
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[testing::InjectedFault::DeviceLost.q(), 0.0]));
         let step = modalcast_model::scene::RawStepUpdate { number: 1, q_domains: vec![0], q, ..Default::default() };
         Ok((engine, step))
@@ -252,25 +255,72 @@ impl Engine {
     }
 
     /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
-    /// name is already open from the same source, returns the open scene. With an empty source, opens a scene of the
-    /// catalog again, for example one that has failed or that the crash log sets aside. A new scene counts to `client`,
-    /// if there is one.
+    /// name is already open from the same source and the principal may use that scene, returns it. With an empty source,
+    /// opens a scene of the catalog again, for example one that has failed or that the crash log sets aside. A new scene
+    /// belongs to `principal` and counts to `client`, if there is one.
     ///
     /// # Errors
-    /// `NameTaken` when the name belongs to another source, `LimitReached` when too many scenes are open, and the
-    /// errors of [`SceneSource::open`].
-    pub async fn open(&self, source: &str, name: &str, client: Option<ClientId>) -> Result<Arc<SceneHandle>> {
+    /// `NameTaken` when the name belongs to another source or to a scene that the principal may not use, `LimitReached`
+    /// when too many scenes are open, and the errors of [`SceneSource::open`].
+    pub async fn open(
+        &self,
+        source: &str,
+        name: &str,
+        principal: &Principal,
+        client: Option<ClientId>,
+    ) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
             storage::provenance::default_scene_name(source)?
         } else {
             validate_scene_name(name)?.to_owned()
         };
-        let listed = source.is_empty().then(|| self.shared.scene_catalog.entries().remove(&name)).flatten();
-        let provenance = listed.unwrap_or_else(|| SceneProvenance::Repository { source: source.into() });
-        self.open_once(name, provenance, client).await
+        let provenance = SceneProvenance::Repository { source: source.into() };
+        let is_same_scene = |listed: &SceneRecord| source.is_empty() || listed.provenance == provenance;
+        let record = match self.listed_record(&name, principal)? {
+            Some(listed) if is_same_scene(&listed) => listed,
+            _ => SceneRecord { provenance, access: SceneAccess::new(principal) },
+        };
+        self.open_once(name, record, principal, client).await
     }
 
-    /// The open scene with this name.
+    /// The record of a scene in the catalog, which may be one that has failed. `None` if the name is free.
+    ///
+    /// # Errors
+    /// `NameTaken` when the principal may not know of the scene.
+    fn listed_record(&self, name: &str, principal: &Principal) -> Result<Option<SceneRecord>> {
+        let listed = self.shared.scene_catalog.find(name);
+        match &listed {
+            Some(record) if record.access.right_of(principal).is_none() => Err(registry::hidden_name_error(name)),
+            _ => Ok(listed),
+        }
+    }
+
+    /// Checks that a principal may upload a scene with this name. The upload replaces a scene of the catalog that has
+    /// failed.
+    ///
+    /// # Errors
+    /// `NameTaken` when the principal does not control that scene.
+    fn check_replacement(&self, name: &str, principal: &Principal) -> Result<()> {
+        match self.listed_record(name, principal)? {
+            Some(record) if record.access.right_of(principal) < Some(SceneRight::Control) => {
+                Err(Error::NameTaken { name: name.into(), owner: record.provenance.label() })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Checks that a principal has a right to a scene that is open, being opened or in the catalog.
+    ///
+    /// # Errors
+    /// `NotFound` when there is no such scene or the principal may not know of it; `NotPermitted` when the principal may
+    /// only use the scene.
+    fn check_right(&self, name: &str, principal: &Principal, right: SceneRight) -> Result<()> {
+        let access = self.shared.registry.find_entry(name).map(|entry| entry.access().borrow().clone());
+        let access = access.or_else(|| self.shared.scene_catalog.find(name).map(|record| record.access));
+        access.ok_or_else(|| scene_not_open(name))?.check(name, principal, right)
+    }
+
+    /// The open scene with this name, for the server itself.
     ///
     /// # Errors
     /// `NotFound` when no open scene has this name, `Busy` while it is being opened, `ShuttingDown` when the server is
@@ -280,14 +330,34 @@ impl Engine {
         self.shared.registry.find(name)
     }
 
-    /// As [`Self::find`], but waits for a scene that is being opened.
+    /// The open scene with this name, for a principal that needs a right to it. Waits for a scene that is being opened.
     ///
     /// # Errors
-    /// As for [`Self::find`], and `NotFound` when the opening fails.
-    pub async fn find_opened(&self, name: &str) -> Result<Arc<SceneHandle>> {
+    /// As for [`Self::find`]; `NotFound` when the opening fails or the principal may not know of the scene;
+    /// `NotPermitted` when the principal may only use the scene.
+    pub async fn find_opened(&self, name: &str, principal: &Principal, right: SceneRight) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
+        self.check_right(name, principal, right)?;
         self.shared.registry.wait_until_opened(name).await;
         self.find(name)
+    }
+
+    /// Shares a scene with other principals, in place of those with whom it was shared: [`EVERYONE`], or names. Returns
+    /// who may use the scene now.
+    ///
+    /// # Errors
+    /// Those of [`Self::find_opened`]; `Invalid` for a malformed name; `Fault` when the catalog cannot be written.
+    pub async fn share(&self, name: &str, principal: &Principal, principals: Vec<String>) -> Result<SceneAccess> {
+        let scene_handle = self.find_opened(name, principal, SceneRight::Control).await?;
+        let access = scene_handle.access().share_with(principals)?;
+        let (engine, name, new_access) = (self.clone(), name.to_owned(), access.clone());
+        let change = move || {
+            engine.shared.scene_catalog.set_access(&name, new_access.clone())?;
+            engine.shared.registry.set_access(&name, &new_access);
+            Ok(())
+        };
+        run_blocking("scenes.json", change).await?;
+        Ok(access)
     }
 
     /// Registers a frame stream, so that its cameras can be moved until the registration is dropped.
@@ -306,9 +376,9 @@ impl Engine {
         self.shared.frame_streams.find(id)
     }
 
-    /// All scenes that are open or being opened, sorted by name.
-    pub fn list(&self) -> SceneList {
-        self.shared.registry.list()
+    /// The scenes that a principal may use, sorted by name.
+    pub fn list(&self, principal: &Principal) -> SceneList {
+        self.shared.registry.list(principal)
     }
 
     /// The sources that [`Self::open`] accepts.
@@ -320,13 +390,13 @@ impl Engine {
         run_blocking("repository", move || Ok(source.list())).await
     }
 
-    /// Begins an upload, which counts to `client`.
+    /// Begins an upload of `principal`, which counts to `client`.
     ///
     /// # Errors
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `NameTaken` when the name
     /// is in use; `Busy` when too many uploads are in progress; `LimitReached` when the client has too many uploads, or
     /// too many bytes would be stored; `Fault` of the disk.
-    pub async fn begin_upload(&self, header: UploadHeader, client: ClientId) -> Result<Upload> {
+    pub async fn begin_upload(&self, header: UploadHeader, principal: &Principal, client: ClientId) -> Result<Upload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
@@ -334,20 +404,26 @@ impl Engine {
             return Err(invalid("header.files", format!("1 to {} files", config.upload_files), header.files));
         }
         self.check_upload_bytes(header.total_bytes)?;
-        let permit = self.permit_upload(&header.scene, client, header.total_bytes)?;
+        let permit = self.permit_upload(&header.scene, principal, client, header.total_bytes)?;
         let (upload_folder, file_system) = (self.shared.scene_catalog.uploads(), self.file_system());
-        run_blocking("upload", move || Upload::begin(&upload_folder, &file_system, header, permit)).await
+        let reusable = self.shared.scene_catalog.upload_folders_of(&principal.name);
+        run_blocking("upload", move || Upload::begin(&upload_folder, &file_system, header, permit, reusable)).await
     }
 
     /// Begins an upload of arrays.
     ///
     /// # Errors
     /// As for [`Self::begin_upload`].
-    pub async fn begin_array_upload(&self, header: ArrayUploadHeader, client: ClientId) -> Result<ArrayUpload> {
+    pub async fn begin_array_upload(
+        &self,
+        header: ArrayUploadHeader,
+        principal: &Principal,
+        client: ClientId,
+    ) -> Result<ArrayUpload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
         self.check_upload_bytes(header.total_bytes)?;
-        let permit = self.permit_upload(&header.scene, client, header.total_bytes)?;
+        let permit = self.permit_upload(&header.scene, principal, client, header.total_bytes)?;
         let (upload_folder, file_system) = (self.shared.scene_catalog.uploads(), self.file_system());
         let memory = self.shared.memory.new_scene().host;
         run_blocking("upload", move || ArrayUpload::begin(&upload_folder, &file_system, header, permit, memory)).await
@@ -365,50 +441,54 @@ impl Engine {
         }
     }
 
-    /// Checks that a client may upload a scene with this name, and counts the upload until the permit is dropped.
-    fn permit_upload(&self, scene: &str, client: ClientId, bytes: u64) -> Result<UploadPermit> {
-        self.shared.registry.check_upload(scene, &client)?;
+    /// Checks that a client of `principal` may upload a scene with this name, and counts the upload until the permit is
+    /// dropped.
+    fn permit_upload(&self, scene: &str, principal: &Principal, client: ClientId, bytes: u64) -> Result<UploadPermit> {
+        self.check_replacement(scene, principal)?;
+        self.shared.registry.check_upload(scene, principal, &client)?;
         self.shared.upload_quota.admit(client, bytes)
     }
 
-    /// For each hash, whether a file of an uploaded scene has this content.
+    /// For each hash, whether a file of a principal's uploads has this content.
     ///
     /// # Errors
     /// `Fault` when the search panics.
-    pub async fn find_uploaded_files(&self, hashes: Vec<ContentHash>) -> Result<Vec<bool>> {
-        let uploads = self.shared.scene_catalog.uploads();
+    pub async fn find_uploaded_files(&self, hashes: Vec<ContentHash>, principal: &Principal) -> Result<Vec<bool>> {
+        let folders = self.shared.scene_catalog.upload_folders_of(&principal.name);
         let find = move || {
-            let files = find_uploaded_files(&uploads);
+            let files = find_uploaded_files(&folders);
             Ok(hashes.iter().map(|hash| files.contains_key(hash)).collect())
         };
         run_blocking("upload", find).await
     }
 
-    /// Opens a complete upload as a scene. On failure, and when the caller is cancelled, the uploaded files are removed.
+    /// Opens a complete upload as a scene of `principal`. On failure, and when the caller is cancelled, the uploaded files are removed.
     ///
     /// # Errors
     /// `Invalid` naming the missing or malformed file; `NameTaken` when another scene was opened under the name since
     /// [`Self::begin_upload`].
-    pub async fn finish_upload(&self, upload: Upload) -> Result<Arc<SceneHandle>> {
-        self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
+    pub async fn finish_upload(&self, upload: Upload, principal: &Principal) -> Result<Arc<SceneHandle>> {
+        self.open_upload(run_blocking("upload", move || upload.finish()).await?, principal).await
     }
 
-    /// Opens a complete upload of arrays as a scene. On failure, and when the caller is cancelled, the uploaded files are
-    /// removed.
+    /// Opens a complete upload of arrays as a scene of `principal`. On failure, and when the caller is cancelled, the
+    /// uploaded files are removed.
     ///
     /// # Errors
     /// As for [`Self::finish_upload`].
-    pub async fn finish_array_upload(&self, upload: ArrayUpload) -> Result<Arc<SceneHandle>> {
-        self.open_upload(run_blocking("upload", move || upload.finish()).await?).await
+    pub async fn finish_array_upload(&self, upload: ArrayUpload, principal: &Principal) -> Result<Arc<SceneHandle>> {
+        self.open_upload(run_blocking("upload", move || upload.finish()).await?, principal).await
     }
 
     /// Closes a scene and ends its streams; removes its persisted step and, for an upload, its files.
     ///
     /// # Errors
-    /// `NotFound` when the name is neither open nor in the list of open scenes, `Busy` while the scene is being opened.
-    pub async fn close(&self, name: &str) -> Result<()> {
+    /// `NotFound` when the name is neither open nor in the list of open scenes, or the principal may not know of it;
+    /// `NotPermitted` when the principal does not control the scene; `Busy` while the scene is being opened.
+    pub async fn close(&self, name: &str, principal: &Principal) -> Result<()> {
         let engine = self.clone();
         let name = validate_scene_name(name)?.to_owned();
+        self.check_right(&name, principal, SceneRight::Control)?;
         // A separate task, so that closing completes even if the caller is cancelled.
         let work = async move { engine.close_scene(&name).await };
         tokio::spawn(work).await.map_err(modalcast_model::error::fault_in("close"))?
@@ -420,7 +500,7 @@ impl Engine {
         if self.shared.is_stopping.swap(true, Ordering::AcqRel) {
             return;
         }
-        for scene_handle in self.list().open {
+        for scene_handle in self.list(&Principal::owner()).open {
             scene_handle.stop(Error::ShuttingDown).await;
         }
         let engine = self.clone();
@@ -496,8 +576,10 @@ mod tests {
         let engine = Engine::start_with_device(Arc::new(config), Arc::new(StripsSource), open_device)
             .await
             .expect("expected a running engine");
-        let faulty_scene = engine.open("strips", "faulty", None).await.expect("expected an open scene");
-        let control_scene = engine.open("strips", "control", None).await.expect("expected an open scene");
+        let faulty_scene =
+            engine.open("strips", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
+        let control_scene =
+            engine.open("strips", "control", &Principal::owner(), None).await.expect("expected an open scene");
         (engine, faulty_scene, control_scene)
     }
 
@@ -551,15 +633,16 @@ mod tests {
 
         let error = engine.find("faulty").expect_err("expected an error for a failed scene");
         assert!(matches!(error, Error::NotFound { .. }), "expected NotFound, got {error}");
-        let names = engine.list().open.iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
+        let names = engine.list(&Principal::owner()).open.iter().map(|scene| scene.name.clone()).collect::<Vec<_>>();
         assert_eq!(names, ["control"]);
         let rest_state = Arc::new(modalcast_model::scene::SceneState::rest(&faulty_scene.scene));
         let deformation = engine.shared.services.device.deform(faulty_scene.id(), &rest_state, None);
         let error = await_within_limit(deformation.wait()).await.expect_err("expected an unloaded scene").to_string();
         assert!(error.contains("not loaded"), "expected 'not loaded', got {error}");
         assert!(is_done(&send_step(&mut control_writer, 2, 0.5).await), "expected the control scene to continue");
-        let reopened_scene =
-            await_within_limit(engine.open("strips", "faulty", None)).await.expect("expected to reopen the scene");
+        let reopened_scene = await_within_limit(engine.open("strips", "faulty", &Principal::owner(), None))
+            .await
+            .expect("expected to reopen the scene");
         let restored_step = reopened_scene.last_step().map(|step| step.number);
         assert_eq!(restored_step, Some(1), "expected the step of the checkpoint");
         engine.shutdown().await;
@@ -571,12 +654,15 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let (engine, _, _) = start_faulty_engine(folder.path()).await;
         let opening_engine = engine.clone();
-        let opening = tokio::spawn(async move { opening_engine.open("strips", "late", None).await.map(drop) });
+        let opening =
+            tokio::spawn(
+                async move { opening_engine.open("strips", "late", &Principal::owner(), None).await.map(drop) },
+            );
         let is_listed = |names: &[&str]| names.contains(&"late");
         await_within_limit(async {
             let mut was_listed = false;
             loop {
-                let list = engine.list();
+                let list = engine.list(&Principal::owner());
                 let open = is_listed(&list.open.iter().map(|scene| scene.name.as_str()).collect::<Vec<_>>());
                 let opening = is_listed(&list.opening.iter().map(String::as_str).collect::<Vec<_>>());
                 assert!(!(open && opening) && (open || opening || !was_listed), "expected the scene in one list");
@@ -631,11 +717,12 @@ mod tests {
         };
         for is_canceled in [true, false] {
             let header = UploadHeader { scene: "upload".into(), entry: String::new(), files: 1, total_bytes: 0 };
-            let upload = engine.begin_upload(header, ClientId::Connection(1)).await;
+            let upload = engine.begin_upload(header, &Principal::owner(), ClientId::Connection(1)).await;
             let mut upload = upload.expect("expected an accepted upload");
             upload.begin_file("a.obj", 0, &sha2::Sha256::digest(b"")).expect("expected an accepted file");
             let opening_engine = engine.clone();
-            let caller = tokio::spawn(async move { opening_engine.finish_upload(upload).await.map(drop) });
+            let caller =
+                tokio::spawn(async move { opening_engine.finish_upload(upload, &Principal::owner()).await.map(drop) });
             // The files are at their place when the source is asked to open them.
             wait_until(&|| uploads.join("upload").exists()).await;
             if is_canceled {
@@ -648,7 +735,10 @@ mod tests {
             }
             let expected = usize::from(!is_canceled);
             assert_eq!(std::fs::read_dir(&uploads).expect("expected a folder").count(), expected);
-            assert_eq!((engine.shared.scene_catalog.entries().len(), engine.list().open.len()), (expected, expected));
+            assert_eq!(
+                (engine.shared.scene_catalog.entries().len(), engine.list(&Principal::owner()).open.len()),
+                (expected, expected)
+            );
         }
         engine.shutdown().await;
     }
@@ -662,15 +752,18 @@ mod tests {
         faulty_scene.inject_panic().await;
         let panic = await_within_limit(writer.next_report()).await.expect_err("expected the panic");
         let provenance = SceneProvenance::Repository { source: "strips".into() };
-        let request = engine.open_request("late", &provenance, None);
-        let entry = engine.shared.registry.reserve(&request, true).expect("expected a place");
+        let record = SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) };
+        let request = engine.open_request("late", &record, None);
+        let entry = engine.shared.registry.reserve(&request, &Principal::owner(), true).expect("expected a place");
         let opened = entry.get_or_open(async || Ok(Arc::clone(&faulty_scene))).await;
         assert_eq!(opened.expect_err("expected the error of the scene"), panic);
         engine.end_opening("late", &entry);
-        let list = engine.list();
+        let list = engine.list(&Principal::owner());
         let is_late = |failed: &FailedScene| failed.name == "late" && failed.error == panic;
         assert!(list.failed.iter().any(is_late) && list.opening.is_empty(), "{:?}", list.failed);
-        await_within_limit(engine.open("strips", "late", None)).await.expect("expected that the name is free");
+        await_within_limit(engine.open("strips", "late", &Principal::owner(), None))
+            .await
+            .expect("expected that the name is free");
         engine.shutdown().await;
     }
 
@@ -724,7 +817,12 @@ mod tests {
         assert_eq!(await_within_limit(subscription.next()).await.expect_err("expected the loss"), loss);
         assert_eq!(await_within_limit(engine.device_lost()).await, loss);
         assert_eq!(engine.find("control").expect_err("expected the loss"), loss);
-        assert_eq!(await_within_limit(engine.open("strips", "new", None)).await.expect_err("expected the loss"), loss);
+        assert_eq!(
+            await_within_limit(engine.open("strips", "new", &Principal::owner(), None))
+                .await
+                .expect_err("expected the loss"),
+            loss
+        );
         await_within_limit(engine.shutdown()).await;
     }
 }

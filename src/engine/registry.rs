@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 
-use tokio::sync::OnceCell;
+use tokio::sync::{OnceCell, watch};
 
 use super::lock::lock;
 use super::scene_not_open;
@@ -13,13 +13,15 @@ use super::upload_quota::ClientId;
 use crate::engine::device::command::SceneId;
 use crate::engine::scene::handle::SceneHandle;
 use crate::engine::storage::provenance::SceneProvenance;
+use crate::engine::storage::scene_record::{SceneAccess, SceneRecord, SharedAccess};
+use crate::identity::Principal;
 use modalcast_model::error::{Error, Result};
 
 /// A scene that is to be opened.
 #[derive(Debug, Clone)]
 pub(super) struct OpenRequest {
     pub(super) name: String,
-    pub(super) provenance: SceneProvenance,
+    pub(super) record: SceneRecord,
     /// The client that the scene counts to. `None` for a scene of the last run.
     pub(super) client: Option<ClientId>,
     pub(super) is_built_in: bool,
@@ -41,11 +43,13 @@ pub struct FailedScene {
     /// Readable description of where the scene comes from.
     pub source: String,
     pub error: Error,
+    pub access: SceneAccess,
 }
 
 /// A reserved name, and its scene once the scene is loaded.
 pub(super) struct RegistryEntry {
     provenance: SceneProvenance,
+    access: SharedAccess,
     client: Option<ClientId>,
     /// Whether the scene has a place beyond the limit, which each built-in scene has once.
     has_extra_place: bool,
@@ -75,6 +79,15 @@ impl RegistryEntry {
         }
     }
 
+    /// The record of the scene in the catalog.
+    pub(super) fn record(&self) -> SceneRecord {
+        SceneRecord { provenance: self.provenance.clone(), access: self.access.borrow().clone() }
+    }
+
+    pub(super) const fn access(&self) -> &SharedAccess {
+        &self.access
+    }
+
     /// The scene; `None` while it is not loaded.
     pub(super) fn scene_handle(&self) -> Option<&Arc<SceneHandle>> {
         self.cell.get()
@@ -100,22 +113,28 @@ impl Registry {
         }
     }
 
-    /// Reserves a name for a call that opens it, or joins an existing reservation with the same provenance. With
-    /// `must_be_new` an existing reservation is an error. The call ends with [`Self::release`]. The first scene of each
+    /// Reserves a name for a call of `principal` that opens it, or joins an existing reservation with the same provenance
+    /// that the principal may use. With `must_be_new` an existing reservation is an error. The call ends with [`Self::release`]. The first scene of each
     /// built-in source does not count for the limits, so that other scenes cannot lock it out.
     ///
     /// # Errors
     /// `NameTaken` when the name is reserved for another provenance, `LimitReached` when too many scenes are open.
-    pub(super) fn reserve(&self, request: &OpenRequest, must_be_new: bool) -> Result<Arc<RegistryEntry>> {
-        let OpenRequest { name, provenance, client, is_built_in } = request;
+    pub(super) fn reserve(
+        &self,
+        request: &OpenRequest,
+        principal: &Principal,
+        must_be_new: bool,
+    ) -> Result<Arc<RegistryEntry>> {
+        let OpenRequest { name, record: SceneRecord { provenance, access }, client, is_built_in } = request;
         let mut entries = self.lock();
         if let Some(entry) = entries.get(name) {
-            return match !must_be_new && entry.provenance == *provenance {
+            let may_join = entry.access.borrow().right_of(principal).is_some() && entry.provenance == *provenance;
+            return match !must_be_new && may_join {
                 true => {
                     entry.open_calls.fetch_add(1, Ordering::Relaxed);
                     Ok(Arc::clone(entry))
                 }
-                false => Err(name_taken_error(name, entry)),
+                false => Err(name_taken_error(name, entry, principal)),
             };
         }
         let has_extra_place = *is_built_in && !entries.values().any(|entry| entry.provenance == *provenance);
@@ -124,6 +143,7 @@ impl Registry {
         }
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
+            access: Arc::new(watch::Sender::new(access.clone())),
             client: client.clone(),
             has_extra_place,
             cell: OnceCell::new(),
@@ -150,14 +170,14 @@ impl Registry {
         Ok(())
     }
 
-    /// Checks that a client can upload a scene with this name.
+    /// Checks that a client of `principal` can upload a scene with this name.
     ///
     /// # Errors
     /// `NameTaken` when the name is reserved, `LimitReached` when too many scenes are open.
-    pub(super) fn check_upload(&self, name: &str, client: &ClientId) -> Result<()> {
+    pub(super) fn check_upload(&self, name: &str, principal: &Principal, client: &ClientId) -> Result<()> {
         let entries = self.lock();
         match entries.get(name) {
-            Some(entry) => Err(name_taken_error(name, entry)),
+            Some(entry) => Err(name_taken_error(name, entry, principal)),
             None => self.check_limits(&entries, Some(client)),
         }
     }
@@ -198,9 +218,20 @@ impl Registry {
     }
 
     /// Records that a scene could not be opened again.
-    pub(super) fn record_failure(&self, name: &str, provenance: &SceneProvenance, error: Error) {
-        let failed = FailedScene { name: name.to_owned(), source: provenance.label(), error };
+    pub(super) fn record_failure(&self, name: &str, record: &SceneRecord, error: Error) {
+        let SceneRecord { provenance, access } = record;
+        let failed = FailedScene { name: name.to_owned(), source: provenance.label(), error, access: access.clone() };
         lock(&self.failed).insert(name.to_owned(), failed);
+    }
+
+    /// Changes who may use a scene.
+    pub(super) fn set_access(&self, name: &str, access: &SceneAccess) {
+        if let Some(entry) = self.lock().get(name) {
+            entry.access.send_replace(access.clone());
+        }
+        if let Some(failed) = lock(&self.failed).get_mut(name) {
+            failed.access = access.clone();
+        }
     }
 
     /// A deleted scene is no longer a failed one.
@@ -208,12 +239,15 @@ impl Registry {
         lock(&self.failed).remove(name);
     }
 
-    /// The scenes, sorted by name. The state of each scene is read once, so that a scene that is loaded meanwhile is
-    /// not missing.
-    pub(super) fn list(&self) -> SceneList {
+    /// The scenes that a principal may use, sorted by name. The state of each scene is read once, so that a scene that is
+    /// loaded meanwhile is not missing.
+    pub(super) fn list(&self, principal: &Principal) -> SceneList {
         let entries = self.lock();
-        let mut list = SceneList { open: Vec::new(), opening: Vec::new(), failed: self.failed_among(&entries) };
-        for (name, entry) in entries.iter() {
+        let may_use = |access: &SceneAccess| access.right_of(principal).is_some();
+        let mut failed = self.failed_among(&entries);
+        failed.retain(|failed| may_use(&failed.access));
+        let mut list = SceneList { open: Vec::new(), opening: Vec::new(), failed };
+        for (name, entry) in entries.iter().filter(|(_, entry)| may_use(&entry.access.borrow())) {
             match entry.scene_handle() {
                 Some(scene_handle) if scene_handle.is_closing() => {}
                 Some(scene_handle) => list.open.push(Arc::clone(scene_handle)),
@@ -246,7 +280,7 @@ impl Registry {
         let is_registered = |entry: &&Arc<RegistryEntry>| entry.scene_handle().is_some_and(|scene| scene.id() == id);
         let Some(entry) = entries.get(name).filter(is_registered).cloned() else { return };
         if let Some(error) = entry.scene_handle().and_then(|scene_handle| scene_handle.failure()) {
-            self.record_failure(name, &entry.provenance, error.clone());
+            self.record_failure(name, &entry.record(), error.clone());
         }
         entries.remove(name);
     }
@@ -256,24 +290,36 @@ impl Registry {
     }
 }
 
-fn name_taken_error(name: &str, entry: &RegistryEntry) -> Error {
-    Error::NameTaken { name: name.into(), owner: entry.provenance.label() }
+/// The error of a name that another scene has. It does not describe a scene that the principal may not know of.
+fn name_taken_error(name: &str, entry: &RegistryEntry, principal: &Principal) -> Error {
+    let owner = match entry.access.borrow().right_of(principal) {
+        Some(_) => entry.provenance.label(),
+        None => return hidden_name_error(name),
+    };
+    Error::NameTaken { name: name.into(), owner }
+}
+
+/// The error of a name that belongs to a scene of which the principal may not know.
+pub(super) fn hidden_name_error(name: &str) -> Error {
+    Error::NameTaken { name: name.into(), owner: "a scene of another principal".into() }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::identity::Role;
 
     fn request(name: &str, client: u64, is_built_in: bool) -> OpenRequest {
         let source = if is_built_in { "tree" } else { name }.to_owned();
         let (provenance, client) = (SceneProvenance::Repository { source }, Some(ClientId::Connection(client)));
-        OpenRequest { name: name.to_owned(), provenance, client, is_built_in }
+        let record = SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) };
+        OpenRequest { name: name.to_owned(), record, client, is_built_in }
     }
 
     #[test]
     fn clients_have_a_limit_and_the_built_in_scene_has_a_place() {
         let registry = Registry::new(3, 2);
-        let reserve = |name: &str, client| registry.reserve(&request(name, client, false), false);
+        let reserve = |name: &str, client| registry.reserve(&request(name, client, false), &Principal::owner(), false);
         let limit = |result: Result<Arc<RegistryEntry>>| match result {
             Err(Error::LimitReached { objects, limit }) => (objects, limit),
             _ => panic!("expected LimitReached"),
@@ -285,25 +331,49 @@ mod tests {
         assert_eq!(limit(reserve("d", 2)), ("open scenes", 3));
         reserve("a", 2).expect("expected another client to join");
         registry.release("a", &first);
-        registry.reserve(&request("tree", 1, true), false).expect("expected a place for the built-in scene");
-        let second_tree = registry.reserve(&request("tree 2", 3, true), false);
+        registry
+            .reserve(&request("tree", 1, true), &Principal::owner(), false)
+            .expect("expected a place for the built-in scene");
+        let second_tree = registry.reserve(&request("tree 2", 3, true), &Principal::owner(), false);
         assert_eq!(limit(second_tree), ("open scenes", 3), "expected one extra place for each built-in scene");
         assert!(
             matches!(registry.find("tree"), Err(Error::Busy { .. }))
-                && registry.list().opening.contains(&"tree".into())
+                && registry.list(&Principal::owner()).opening.contains(&"tree".into())
         );
         registry.release("a", &first);
         reserve("d", 2).expect("expected the place of the released name");
     }
 
     #[test]
+    fn names_of_other_principals_are_taken_without_a_description() {
+        let registry = Registry::new(3, 3);
+        let [anna, ben] = ["anna", "ben"].map(|name| Principal { name: name.into(), role: Role::Upload });
+        let mut of_anna = request("a", 1, false);
+        of_anna.record.access = SceneAccess::new(&anna);
+        let reserve = |principal| registry.reserve(&of_anna, principal, false);
+        reserve(&anna).expect("expected a place");
+        let taken = |result: Result<Arc<RegistryEntry>>| match result {
+            Err(Error::NameTaken { owner, .. }) => owner,
+            _ => panic!("expected NameTaken"),
+        };
+        assert_eq!(taken(reserve(&ben)), "a scene of another principal");
+        let upload = registry.check_upload("a", &ben, &ClientId::Connection(2));
+        assert_eq!(
+            upload.expect_err("expected an error"),
+            Error::NameTaken { name: "a".into(), owner: "a scene of another principal".into() }
+        );
+        registry.set_access("a", &SceneAccess { shared_with: [ben.name.clone()].into(), ..SceneAccess::new(&anna) });
+        reserve(&ben).expect("expected to join a shared scene");
+    }
+
+    #[test]
     fn failures_are_listed_until_the_scene_is_open_or_deleted() {
         let registry = Registry::new(3, 3);
-        let OpenRequest { provenance, .. } = request("a", 1, false);
-        registry.record_failure("a", &provenance, Error::ShuttingDown);
+        let OpenRequest { record, .. } = request("a", 1, false);
+        registry.record_failure("a", &record, Error::ShuttingDown);
         let names = || registry.failed().into_iter().map(|failed| failed.name).collect::<Vec<_>>();
         assert_eq!(names(), ["a"]);
-        let entry = registry.reserve(&request("a", 1, false), false).expect("expected a place");
+        let entry = registry.reserve(&request("a", 1, false), &Principal::owner(), false).expect("expected a place");
         assert!(names().is_empty());
         registry.release("a", &entry);
         assert_eq!(names(), ["a"]);

@@ -15,10 +15,12 @@ use super::scene_memory::SceneMemory;
 use super::source::StoredUpload;
 use super::storage::provenance::SceneProvenance;
 use super::storage::scene_catalog::folder_bytes;
+use super::storage::scene_record::{SceneAccess, SceneRecord, SharedAccess};
 use super::storage::upload::CompleteUpload;
 use super::storage::upload_record::read_hashes;
 use super::upload_quota::ClientId;
 use super::{Engine, scene_not_open};
+use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{OpenedScene, modes_files};
 
@@ -31,16 +33,16 @@ impl Engine {
     /// start. A scene that the crash log sets aside is not opened.
     pub(super) fn reopen_scenes(&self) {
         let mut openings = tokio::task::JoinSet::new();
-        for (name, provenance) in self.shared.scene_catalog.entries() {
+        for (name, record) in self.shared.scene_catalog.entries() {
             if let Some(error) = self.shared.crash_log.reason(&name) {
                 tracing::warn!(scene = name, %error, "a scene of the last run is set aside");
-                self.shared.registry.record_failure(&name, &provenance, error);
+                self.shared.registry.record_failure(&name, &record, error);
                 continue;
             }
-            let request = self.open_request(&name, &provenance, None);
-            let reserved = self.shared.registry.reserve(&request, false);
+            let request = self.open_request(&name, &record, None);
+            let reserved = self.shared.registry.reserve(&request, &Principal::owner(), false);
             let engine = self.clone();
-            openings.spawn(async move { engine.reopen_scene(reserved, &name, &provenance).await });
+            openings.spawn(async move { engine.reopen_scene(reserved, &name, &record).await });
         }
         let engine = self.clone();
         tokio::spawn(async move {
@@ -49,17 +51,17 @@ impl Engine {
         });
     }
 
-    async fn reopen_scene(&self, reserved: Result<Arc<RegistryEntry>>, name: &str, provenance: &SceneProvenance) {
+    async fn reopen_scene(&self, reserved: Result<Arc<RegistryEntry>>, name: &str, record: &SceneRecord) {
         let record_failure = |error: &Error| {
             tracing::warn!(scene = name, %error, "a scene of the last run could not be reopened");
-            self.shared.registry.record_failure(name, provenance, error.clone());
+            self.shared.registry.record_failure(name, record, error.clone());
         };
         match reserved {
             Err(error) => record_failure(&error),
             Ok(entry) => {
                 let open = async || {
                     self.check_running()?;
-                    self.open_or_discard(name.to_owned(), provenance.clone(), None).await
+                    self.open_or_discard(name.to_owned(), record.provenance.clone(), entry.access(), None).await
                 };
                 let opened = entry.get_or_open(open).await;
                 // `end_opening` records the failure of a loaded scene. The failure of an opening is recorded before the
@@ -74,15 +76,9 @@ impl Engine {
         }
     }
 
-    pub(super) fn open_request(
-        &self,
-        name: &str,
-        provenance: &SceneProvenance,
-        client: Option<ClientId>,
-    ) -> OpenRequest {
-        let is_built_in =
-            matches!(provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
-        OpenRequest { name: name.to_owned(), provenance: provenance.clone(), client, is_built_in }
+    pub(super) fn open_request(&self, name: &str, record: &SceneRecord, client: Option<ClientId>) -> OpenRequest {
+        let is_built_in = matches!(&record.provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
+        OpenRequest { name: name.to_owned(), record: record.clone(), client, is_built_in }
     }
 
     /// Opens a scene of the repository. Concurrent calls with the same name share one opening. The opening runs in a
@@ -90,32 +86,35 @@ impl Engine {
     pub(super) async fn open_once(
         &self,
         name: String,
-        provenance: SceneProvenance,
+        record: SceneRecord,
+        principal: &Principal,
         client: Option<ClientId>,
     ) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
-        let engine = self.clone();
+        let (engine, principal) = (self.clone(), principal.clone());
         let work = async move {
-            let request = engine.open_request(&name, &provenance, client);
-            let entry = engine.shared.registry.reserve(&request, false)?;
-            engine.open_reserved(&entry, name, provenance, None).await
+            let request = engine.open_request(&name, &record, client);
+            let entry = engine.shared.registry.reserve(&request, &principal, false)?;
+            engine.open_reserved(&entry, name, record.provenance, None).await
         };
         tokio::spawn(work).await.map_err(fault_in("open"))?
     }
 
-    /// Opens a complete upload as a new scene. If the caller is cancelled, the scene is closed and its files are removed:
+    /// Opens a complete upload as a new scene of `principal`. If the caller is cancelled, the scene is closed and its files are removed:
     /// the caller does not know the scene, and could not upload it again under the same name.
-    pub(super) async fn open_upload(&self, upload: CompleteUpload) -> Result<Arc<SceneHandle>> {
+    pub(super) async fn open_upload(&self, upload: CompleteUpload, principal: &Principal) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
-        let engine = self.clone();
+        self.check_replacement(&upload.scene, principal)?;
+        let (engine, principal) = (self.clone(), principal.clone());
         // Dropped together with this future.
         let (caller, _waits) = oneshot::channel::<()>();
         let work = async move {
             let (name, client) = (upload.scene.clone(), upload.client().cloned());
             let provenance = SceneProvenance::Upload { entry: upload.entry.clone() };
-            let request = engine.open_request(&name, &provenance, client);
-            let entry = engine.shared.registry.reserve(&request, true)?;
-            let opened = engine.open_reserved(&entry, name.clone(), provenance, Some(upload)).await;
+            let record = SceneRecord { provenance, access: SceneAccess::new(&principal) };
+            let request = engine.open_request(&name, &record, client);
+            let entry = engine.shared.registry.reserve(&request, &principal, true)?;
+            let opened = engine.open_reserved(&entry, name.clone(), record.provenance, Some(upload)).await;
             if opened.is_ok() && caller.is_closed() {
                 tracing::info!(scene = name, "the caller of an upload has gone; the scene is closed");
                 engine.close_scene(&name).await?;
@@ -133,7 +132,8 @@ impl Engine {
         provenance: SceneProvenance,
         upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
-        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, upload)).await;
+        let access = entry.access();
+        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, access, upload)).await;
         self.end_opening(&name, entry);
         opened
     }
@@ -154,10 +154,11 @@ impl Engine {
         &self,
         name: String,
         provenance: SceneProvenance,
+        access: &SharedAccess,
         upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
         let is_new_upload = upload.is_some();
-        let result = self.load_scene(&name, &provenance, upload).await;
+        let result = self.load_scene(&name, &provenance, access, upload).await;
         if result.is_err() && is_new_upload {
             let engine = self.clone();
             let remove = move || {
@@ -175,6 +176,7 @@ impl Engine {
         &self,
         name: &str,
         provenance: &SceneProvenance,
+        access: &SharedAccess,
         upload: Option<CompleteUpload>,
     ) -> Result<SceneHandle> {
         let memory = self.shared.memory.new_scene();
@@ -195,6 +197,7 @@ impl Engine {
         let params = OpenParams {
             name: name.into(),
             provenance: provenance.clone(),
+            access: Arc::clone(access),
             scene,
             backends,
             id,
@@ -204,9 +207,10 @@ impl Engine {
             memory,
         };
         let scene_handle = SceneHandle::open(params, self.shared.services.clone()).await?;
-        let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
+        let (engine, scene_name) = (self.clone(), name.to_owned());
+        let record = SceneRecord { provenance: provenance.clone(), access: access.borrow().clone() };
         if let Err(error) =
-            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&scene_name, &provenance)).await
+            run_blocking("scenes.json", move || engine.shared.scene_catalog.add(&scene_name, &record)).await
         {
             scene_handle.stop(error.clone()).await;
             return Err(error);

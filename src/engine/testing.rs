@@ -203,8 +203,9 @@ impl SceneSource for StripsSource {
 }
 
 /// A request for the lease of a lossless writer.
-pub(crate) const fn lossless_lease(window: u32) -> LeaseRequest {
+pub(crate) fn lossless_lease(window: u32) -> LeaseRequest {
     LeaseRequest {
+        principal: crate::identity::OWNER.into(),
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window,

@@ -12,5 +12,6 @@ mod token;
 
 pub use directory::Directory;
 pub use principal::{Credential, OWNER, Principal};
+pub use principals_file::check_principal_name;
 pub use role::Role;
 pub use token::{TokenHash, new_token};

@@ -115,7 +115,7 @@ impl Credentials {
         let (mut credentials, mut names) = (Self::default(), BTreeSet::new());
         for (index, entry) in entries.principal.into_iter().enumerate() {
             let in_entry = |error: Error| error.in_message(&format!("principal[{index}]"));
-            check_name(&entry.name).map_err(in_entry)?;
+            check_principal_name(&entry.name).map_err(in_entry)?;
             if !names.insert(entry.name.clone()) {
                 return Err(in_entry(invalid("name", "a name that occurs once", format!("'{}'", entry.name))));
             }
@@ -181,8 +181,12 @@ fn take_over_equal<K: Ord>(credentials: &mut BTreeMap<K, Arc<Credential>>, forme
     }
 }
 
-/// Names occur in logs and in error messages.
-fn check_name(name: &str) -> Result<()> {
+/// Checks the name of a principal besides the owner. Names occur in logs and in error messages.
+///
+/// # Errors
+/// `Invalid` for a name with other characters than letters, digits, '-', '_', '.' and '@', of more than 64 characters, and
+/// for the name of the owner.
+pub fn check_principal_name(name: &str) -> Result<()> {
     let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_.@".contains(letter);
     if name.is_empty() || name.len() > MAX_NAME_CHARS || !name.chars().all(is_allowed) {
         let expected = format!("1 to {MAX_NAME_CHARS} letters, digits, '-', '_', '.' or '@'");

@@ -27,6 +27,9 @@ pub enum Error {
     /// Another scene has the name. `owner` is the source of that scene.
     #[error("the scene name '{name}' belongs to '{owner}'")]
     NameTaken { name: String, owner: String },
+    /// The caller may not do this. `given` names the caller.
+    #[error("permission: expected {expected}, got {given}")]
+    NotPermitted { expected: String, given: String },
     /// Another writer holds the lease of the scene. A run is the number of a writer.
     #[error("run {run} has held the writer lease for {seconds} s")]
     LeaseTaken { run: u64, seconds: u64 },

@@ -8,11 +8,11 @@ use tonic::codegen::http::{HeaderMap, header};
 
 use super::connection::ConnectionInfo;
 use super::permissions::{Requirement, requirement_of};
-use super::status::{permission_denied, unauthenticated, unknown_method};
+use super::status::{to_status, unauthenticated, unknown_method};
 use crate::config::{Authentication, Config};
 use crate::engine::lock;
 use crate::identity::{Credential, Directory};
-use modalcast_model::error::Result;
+use modalcast_model::error::{Error, Result};
 
 /// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
 /// delayed, so wrong ones do not lock out other clients.
@@ -96,7 +96,7 @@ impl Authenticator {
         if principal.role < role {
             let expected = format!("the role '{}'", role.name());
             let given = format!("'{}' with the role '{}'", principal.name, principal.role.name());
-            return Err(self.deny(permission_denied(&expected, &given), peer));
+            return Err(self.deny(to_status(Error::NotPermitted { expected, given }), peer));
         }
         Ok(Some(credential))
     }

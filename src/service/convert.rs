@@ -7,8 +7,10 @@ use modalcast_proto::v1;
 use super::status::to_rejection;
 use crate::engine::{
     self, ContentHash, Delivery, Engine, FailedScene, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec,
-    Overflow, PictureSpec, SceneHandle, StepId, StepSelector, StreamDelivery, UploadedShape, WriterSession, parse_hash,
+    Overflow, PictureSpec, SceneAccess, SceneHandle, SceneRight, StepId, StepSelector, StreamDelivery, UploadedShape,
+    WriterSession, parse_hash,
 };
+use crate::identity::Principal;
 use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
 use modalcast_model::error::{Result, invalid};
@@ -64,6 +66,7 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
     let scene = &scene_handle.scene;
     let layout = &scene.layout;
     let bounds = scene.rest_bounds;
+    let SceneAccess { owner, shared_with } = scene_handle.access();
     v1::SceneInfo {
         scene: scene_handle.name.clone(),
         source: scene_handle.provenance.label(),
@@ -81,12 +84,14 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
         durable_step: scene_handle.durable_step().map(wire_step_id),
         remarks: Vec::new(),
         lighting: None,
+        owner,
+        shared_with: shared_with.into_iter().collect(),
     }
 }
 
 /// A scene that could not be opened, and why.
 pub(super) fn wire_failed_scene(failed: FailedScene) -> v1::FailedScene {
-    let FailedScene { name, source, error } = failed;
+    let FailedScene { name, source, error, access: _ } = failed;
     v1::FailedScene { scene: name, source, error: Some(to_rejection(None, &error)) }
 }
 
@@ -150,6 +155,14 @@ pub(super) fn parse_stream_delivery(delivery: i32, max_hz: f64) -> Result<Stream
     StreamDelivery::new(parse_delivery("delivery", delivery)?, max_hz)
 }
 
+/// The right to a scene that a stream with this delivery needs: a lossless stream can slow the writer.
+pub(super) const fn right_to_receive(delivery: StreamDelivery) -> SceneRight {
+    match delivery.delivery() {
+        Delivery::Lossless => SceneRight::Control,
+        Delivery::Latest => SceneRight::Use,
+    }
+}
+
 /// Parses the delivery of a stream, which must be named.
 pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
     match v1::Delivery::try_from(number) {
@@ -164,7 +177,11 @@ pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
 }
 
 /// Parses the request of a writer for the lease of a scene. A window of 0 means `default_window`.
-pub(super) fn parse_lease_request(open: &v1::OpenDrive, default_window: u32) -> Result<LeaseRequest> {
+pub(super) fn parse_lease_request(
+    open: &v1::OpenDrive,
+    principal: &Principal,
+    default_window: u32,
+) -> Result<LeaseRequest> {
     let overflow = match v1::Overflow::try_from(open.overflow) {
         Ok(v1::Overflow::Unspecified | v1::Overflow::Block) => Overflow::Block,
         Ok(v1::Overflow::Reject) => Overflow::Reject,
@@ -179,6 +196,7 @@ pub(super) fn parse_lease_request(open: &v1::OpenDrive, default_window: u32) -> 
     let is_token_given = !open.lease_token.is_empty();
     let token = is_token_given.then(|| LeaseToken::parse("open.lease_token", &open.lease_token)).transpose()?;
     Ok(LeaseRequest {
+        principal: principal.name.clone(),
         delivery: parse_delivery("open.delivery", open.delivery)?,
         overflow,
         window: if open.window == 0 { default_window } else { open.window },

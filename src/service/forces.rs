@@ -6,12 +6,13 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::force::Kind;
 
+use super::caller::Caller;
 use super::convert::{parse_stream_delivery, wire_step_id};
 use super::status::to_status;
-use super::stream::{Deadline, ReplySender, ReplyStream, respond};
+use super::stream::{Deadline, ReplySender, ReplyStream, respond, run_while_permitted};
 use crate::engine::{
     AppliedForce, Engine, Force, ForceKind, ForceOwner, ForceReceipt, ForceReport, ForceSubscription, ForceUpdate,
-    check_force_count,
+    SceneRight, check_force_count,
 };
 use modalcast_model::error::{Result as ModelResult, invalid};
 use modalcast_model::scene::Scene;
@@ -25,8 +26,9 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         &self,
         request: Request<v1::ApplyForcesRequest>,
     ) -> Result<Response<v1::ApplyForcesResponse>, Status> {
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let update = parse_force_update(&scene_handle.scene, &request).map_err(to_status)?;
         let ForceReceipt { owner, receivers } = scene_handle.apply_forces(&update).map_err(to_status)?;
         let lifetime_ms = update.lifetime.as_millis() as u32;
@@ -40,12 +42,15 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         request: Request<v1::StreamForcesRequest>,
     ) -> Result<Response<Self::StreamForcesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let delivery = parse_stream_delivery(v1::Delivery::Latest.into(), request.max_hz).map_err(to_status)?;
+        let right_ended = scene_handle.right_ended(&principal, SceneRight::Use);
         let subscription = ForceSubscription::new(scene_handle, delivery, request.passive).map_err(to_status)?;
         Ok(respond(move |reply_sender| {
-            deadline.enforce("the stream of forces", send_reports(subscription, reply_sender))
+            let work = run_while_permitted(right_ended, send_reports(subscription, reply_sender));
+            deadline.enforce("the stream of forces", work)
         }))
     }
 }

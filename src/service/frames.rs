@@ -10,19 +10,20 @@ use tonic::{Request, Response, Status};
 use v1::render_frame_response::Part as SinglePart;
 use v1::stream_frames_response::Part as StreamPart;
 
+use super::caller::Caller;
 use super::connection::ConnectionInfo;
 use super::convert::{
     FrameUse, RequestedPicture, count_pixels, describe_step_selector, parse_moved_cameras, parse_pictures,
-    parse_step_selector, parse_stream_delivery, wire_delivery, wire_format, wire_frame_info, wire_picture, wire_stages,
-    wire_step_id,
+    parse_step_selector, parse_stream_delivery, right_to_receive, wire_delivery, wire_format, wire_frame_info,
+    wire_picture, wire_stages, wire_step_id,
 };
 use super::picks;
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
-use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
+use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond, run_while_permitted};
 use crate::engine::{
     EncodedFrame, EncodedSubscription, Engine, FrameFormat, FrameQueue, FrameStreamEntry, FrameStreamRegistration,
-    OutputSpec, StreamDelivery, StreamId,
+    OutputSpec, SceneRight, StreamDelivery, StreamId,
 };
 use modalcast_model::error::fault;
 
@@ -44,8 +45,10 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
+        let scene_handle =
+            self.engine.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let pictures =
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Still).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
@@ -74,7 +77,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        picks::respond_to_pick(&self.engine, deadline, request.into_inner()).await
+        let principal = Caller::of(&request)?.principal;
+        picks::respond_to_pick(&self.engine, &principal, deadline, request.into_inner()).await
     }
 
     async fn update_frame_stream(
@@ -99,11 +103,13 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
+        let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
+        let right = right_to_receive(delivery);
+        let scene_handle = self.engine.find_opened(&request.scene, &principal, right).await.map_err(to_status)?;
         let pictures =
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Stream).map_err(to_status)?;
-        let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
@@ -121,7 +127,11 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             max_chunk_bytes: self.engine.config().chunk_bytes,
             _pixels: pixels,
         };
-        Ok(respond(move |reply_sender| deadline.enforce("the frame stream", frame_stream.run(frames, reply_sender))))
+        let right_ended = scene_handle.right_ended(&principal, right);
+        Ok(respond(move |reply_sender| {
+            let work = run_while_permitted(right_ended, frame_stream.run(frames, reply_sender));
+            deadline.enforce("the frame stream", work)
+        }))
     }
 }
 

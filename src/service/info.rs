@@ -5,8 +5,8 @@ use std::time::Duration;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
+use super::caller::Caller;
 use super::connection::MAX_DRIVES;
-use super::routes::caller;
 use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
 use crate::identity::Role;
@@ -25,7 +25,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
         request: Request<v1::GetServerInfoRequest>,
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
         // The token in the URL of the viewer admits calls of the owner.
-        let is_admin = caller(&request).is_some_and(|credential| credential.principal().role == Role::Admin);
+        let is_admin = Caller::of(&request)?.principal.role == Role::Admin;
         let info = self.engine.info();
         let config = self.engine.config();
         let (renderer, is_software) = match &info.renderer {

@@ -3,6 +3,7 @@
 
 mod accept;
 mod authentication;
+mod caller;
 mod connection;
 mod connection_table;
 mod control_frames;

@@ -12,7 +12,7 @@ pub(super) enum Requirement {
 }
 
 /// Every method of every service. A method that is not listed is denied.
-const METHODS: [(&str, Requirement); 26] = {
+const METHODS: [(&str, Requirement); 27] = {
     use Requirement::{Public, Role as Requires};
     use Role::{Drive, Interact, Pixels, Upload, View};
     [
@@ -37,6 +37,7 @@ const METHODS: [(&str, Requirement); 26] = {
         ("modalcast.v1.ForceService/ApplyForces", Requires(Interact)),
         ("modalcast.v1.SceneService/OpenScene", Requires(Drive)),
         ("modalcast.v1.SceneService/DeleteScene", Requires(Drive)),
+        ("modalcast.v1.SceneService/ShareScene", Requires(Drive)),
         ("modalcast.v1.StepService/DriveScene", Requires(Drive)),
         ("modalcast.v1.StepService/ResetScene", Requires(Drive)),
         ("modalcast.v1.SceneService/FindUploadedFiles", Requires(Upload)),

@@ -115,6 +115,7 @@ replies_without_data! {
     ListScenesResponse
     OpenSceneResponse
     PickResponse
+    ShareSceneResponse
     StreamForcesResponse
     UploadArraysResponse
     UploadSceneResponse

@@ -12,6 +12,7 @@ use tonic::server::NamedService;
 use tonic::{Code, Status};
 
 use super::authentication::{Authenticator, Denial};
+use super::caller::CallCredential;
 use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
 use super::reply_budget::CountedReplyBody;
@@ -26,15 +27,6 @@ use modalcast_model::error::Error;
 const TIMEOUT_MARGIN: Duration = Duration::from_millis(20);
 
 type Route = Arc<dyn Fn(Request<Body>) -> BoxFuture<Response<Body>, Infallible> + Send + Sync>;
-
-/// The credential of a call, in the extensions of its request. `None` for a method that requires none.
-#[derive(Clone)]
-struct Caller(Option<Arc<Credential>>);
-
-/// The credential with which a request was admitted.
-pub(super) fn caller<T>(request: &tonic::Request<T>) -> Option<&Arc<Credential>> {
-    request.extensions().get::<Caller>()?.0.as_ref()
-}
 
 /// All services of the server.
 #[derive(Clone)]
@@ -77,8 +69,7 @@ fn with_transport_details(response: Response<Body>, max_message_bytes: usize) ->
 }
 
 impl Routes {
-    /// Calls the service that the path names, if the caller may. The request has the caller's [`Credential`] in its
-    /// extensions, unless the method requires none.
+    /// Calls the service that the path names, if the caller may. The request has the [`CallCredential`] in its extensions.
     pub(super) fn call(&self, mut request: Request<Body>) -> BoxFuture<Response<Body>, Infallible> {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         let Some(route) = self.by_name.get(name).cloned() else {
@@ -96,7 +87,7 @@ impl Routes {
                 });
             }
         };
-        request.extensions_mut().insert(Caller(credential.clone()));
+        request.extensions_mut().insert(CallCredential(credential.clone()));
         let timeout = request.headers().get("grpc-timeout");
         let timeout = timeout.and_then(|timeout| parse_timeout(timeout.to_str().ok()?));
         let response = Box::pin(call_within_budgets(route, request, connection, credential));

@@ -7,10 +7,15 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
-use super::convert::{describe_step_selector, parse_step_selector, parse_stream_delivery, wire_stages, wire_step_id};
+use super::caller::Caller;
+use super::convert::{
+    describe_step_selector, parse_step_selector, parse_stream_delivery, right_to_receive, wire_stages, wire_step_id,
+};
 use super::status::to_status;
-use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond};
-use crate::engine::{Engine, OutputSpec, PackedState, StateContent, StateSection, Subscription, pack_state};
+use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond, run_while_permitted};
+use crate::engine::{
+    Engine, OutputSpec, PackedState, SceneRight, StateContent, StateSection, Subscription, pack_state,
+};
 use modalcast_model::domain::Transform;
 use modalcast_model::scene::Scene;
 
@@ -34,8 +39,9 @@ impl v1::state_service_server::StateService for StateServiceImpl {
     async fn get_state(&self, request: Request<v1::GetStateRequest>) -> Result<Response<Self::GetStateStream>, Status> {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
+        let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
         Ok(respond(move |reply_sender| async move {
@@ -60,9 +66,11 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         request: Request<v1::StreamStatesRequest>,
     ) -> Result<Response<Self::StreamStatesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.0.find_opened(&request.scene).await.map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
+        let right = right_to_receive(delivery);
+        let scene_handle = self.0.find_opened(&request.scene, &principal, right).await.map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
         let settings = v1::StateStreamSettings {
@@ -71,10 +79,12 @@ impl v1::state_service_server::StateService for StateServiceImpl {
             steps: request.steps,
             stages_every: request.stages_every,
         };
+        let right_ended = scene_handle.right_ended(&principal, right);
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
         Ok(respond(move |reply_sender| {
-            deadline.enforce("the stream of states", state_stream.run(subscription, reply_sender))
+            let work = run_while_permitted(right_ended, state_stream.run(subscription, reply_sender));
+            deadline.enforce("the stream of states", work)
         }))
     }
 }

@@ -91,6 +91,9 @@ impl ErrorReport {
                 let given = format!("'{name}', which belongs to '{owner}'");
                 Self::new(Code::AlreadyExists, Reason::SceneNameTaken, "a free scene name", given)
             }
+            Error::NotPermitted { expected, given } => {
+                Self::new(Code::PermissionDenied, Reason::PermissionDenied, expected, given)
+            }
             Error::LeaseTaken { run, seconds } => {
                 let given = format!("the lease of run {run}, held for {seconds} s");
                 Self::new(Code::AlreadyExists, Reason::WriterLeaseTaken, "a free writer lease", given)
@@ -232,12 +235,6 @@ pub(super) fn unknown_method() -> Status {
 pub(super) fn unauthenticated(expected: &str, given: &str) -> Status {
     ErrorReport::new(Code::Unauthenticated, Reason::Unauthenticated, expected, given)
         .into_status(format!("credential: expected {expected}, got {given}"))
-}
-
-/// The status of a call that its principal may not make.
-pub(super) fn permission_denied(expected: &str, given: &str) -> Status {
-    ErrorReport::new(Code::PermissionDenied, Reason::PermissionDenied, expected, given)
-        .into_status(format!("permission: expected {expected}, got {given}"))
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 //! a step that cannot be accepted is answered with a rejection. The stream remains open.
 
 use std::collections::VecDeque;
+use std::pin::Pin;
 
 use modalcast_proto::v1;
 use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
@@ -10,13 +11,14 @@ use modalcast_proto::v1::drive_scene_response::Kind as ResponseKind;
 use tokio::sync::OwnedSemaphorePermit;
 use tonic::{Request, Response, Status, Streaming};
 
+use super::caller::Caller;
 use super::connection::ConnectionInfo;
 use super::convert::{parse_lease_request, parse_step, wire_opened, wire_stages, wire_step_id};
 use super::shared_memory::SharedMemory;
 use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
-use crate::engine::{Engine, StepReport, WriterSession};
+use crate::engine::{Engine, SceneRight, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result};
 
 /// Maximum number of replies that are buffered for a client that does not read. A further reply ends the stream with an
@@ -40,16 +42,18 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         &self,
         request: Request<Streaming<v1::DriveSceneRequest>>,
     ) -> Result<Response<Self::DriveSceneStream>, Status> {
+        let caller = Caller::of(&request)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
         let session = DriveSession {
             engine: self.engine.clone(),
-            peer: connection.peer().to_owned(),
+            caller,
             parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits(), memory),
             _drive_permit: drive_permit,
             inbound: request.into_inner(),
+            right_ended: Box::pin(std::future::pending()),
             writer: None,
             replies: VecDeque::new(),
         };
@@ -60,24 +64,30 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         &self,
         request: Request<v1::ResetSceneRequest>,
     ) -> Result<Response<v1::ResetSceneResponse>, Status> {
-        let peer = ConnectionInfo::of(&request).map_err(to_status)?.peer().to_owned();
-        let request = request.into_inner();
-        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
-        let step = scene_handle.reset(&peer, request.take_over).await.map_err(to_status)?;
+        let caller = Caller::of(&request)?;
+        let v1::ResetSceneRequest { scene, take_over } = request.into_inner();
+        let reset = async {
+            let scene_handle = self.engine.find_opened(&scene, &caller.principal, SceneRight::Control).await?;
+            scene_handle.reset(&caller.peer, &caller.principal.name, take_over).await
+        };
+        let step = caller.log_change("ResetScene", &scene, reset.await.map_err(to_status))?;
         Ok(Response::new(v1::ResetSceneResponse { step: Some(wire_step_id(step)) }))
     }
 }
 
+type BoxFuture<T> = Pin<Box<dyn Future<Output = T> + Send>>;
+
 /// The state of one step stream.
 struct DriveSession {
     engine: Engine,
-    /// Name of the client, for the log.
-    peer: String,
+    caller: Caller,
     /// Counts this stream among those of its connection.
     _drive_permit: OwnedSemaphorePermit,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The step that is being received, if it has several parts.
     parts: StepAssembler,
+    /// Completes when the caller loses the right to the scene. Pending until the writer lease is acquired.
+    right_ended: BoxFuture<Error>,
     /// The writer lease, once it is acquired.
     writer: Option<WriterSession>,
     /// Replies that are not sent yet, oldest first.
@@ -114,6 +124,7 @@ impl DriveSession {
                         permit.send(reply)?;
                     }
                 }
+                error = &mut self.right_ended => return self.close_with_error(&reply_sender, error).await,
                 () = reply_sender.closed() => return Ok(()),
             }
         }
@@ -142,10 +153,13 @@ impl DriveSession {
         if self.writer.is_some() {
             return Err(Error::UnexpectedMessage { expected: "one open per stream", given: "a second open" });
         }
-        let scene_handle = self.engine.find_opened(&open.scene).await?;
-        let request = parse_lease_request(&open, self.engine.config().window)?;
-        let writer = scene_handle.drive(&self.peer, request.clone()).await?;
+        let principal = &self.caller.principal;
+        let right = if open.take_over { SceneRight::Control } else { SceneRight::Use };
+        let scene_handle = self.engine.find_opened(&open.scene, principal, right).await?;
+        let request = parse_lease_request(&open, principal, self.engine.config().window)?;
+        let writer = scene_handle.drive(&self.caller.peer, request.clone()).await?;
         let opened = wire_opened(&writer, &request, &scene_handle);
+        self.right_ended = Box::pin(scene_handle.right_ended(principal, right));
         self.writer = Some(writer);
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });
         Ok(())

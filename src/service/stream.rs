@@ -177,6 +177,21 @@ impl Drop for QueuedReplies {
     }
 }
 
+/// Runs the work of a stream until its caller loses the right to the scene. `right_ended` completes then.
+///
+/// # Errors
+/// Those of `work` and `right_ended`.
+pub(super) async fn run_while_permitted(
+    right_ended: impl Future<Output = Error>,
+    work: impl Future<Output = Result<(), Status>>,
+) -> Result<(), Status> {
+    tokio::select! {
+        biased;
+        result = work => result,
+        error = right_ended => Err(to_status(error)),
+    }
+}
+
 /// Creates a reply stream to which `work` sends messages. An error of `work` ends the stream. When the client
 /// disconnects, `work` is dropped at its next await, so that its resources are released. If the client does not read
 /// while others wait for the reply budget, the call ends with `SlowReader`. The stream of the response is empty: its

@@ -1,5 +1,6 @@
 //! Receives the streams of `UploadScene` and `UploadArrays`. Both begin with a header and share one time budget.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
@@ -11,10 +12,19 @@ use super::connection::ConnectionInfo;
 use super::convert::{parse_array_upload_header, parse_upload_header, parse_uploaded_domain};
 use super::status::{to_status, transport_status};
 use crate::engine::{ArrayUpload, ClientId, Engine, Upload};
+use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
 const MIN_UPLOAD_RATE: f64 = 32768.0;
+
+/// Who uploads.
+pub(super) struct Uploader {
+    /// The scene belongs to this principal.
+    principal: Arc<Principal>,
+    /// The bytes of the upload count to this client.
+    client: ClientId,
+}
 
 /// An upload whose parts arrive in a stream.
 pub(super) trait StreamedUpload: Sized + Send + 'static {
@@ -25,7 +35,7 @@ pub(super) trait StreamedUpload: Sized + Send + 'static {
     fn part_of(request: Self::Request) -> Option<Self::Part>;
 
     /// Begins an upload with its first part, which must be a header.
-    fn begin(engine: &Engine, client: &ClientId, part: Self::Part) -> impl Future<Output = Result<Self>> + Send;
+    fn begin(engine: &Engine, uploader: &Uploader, part: Self::Part) -> impl Future<Output = Result<Self>> + Send;
 
     /// Adds a later part. Blocks on the disk.
     fn add_part(&mut self, part: Self::Part) -> Result<()>;
@@ -50,9 +60,12 @@ impl StreamedUpload for Upload {
         request.part
     }
 
-    async fn begin(engine: &Engine, client: &ClientId, part: FilesPart) -> Result<Self> {
+    async fn begin(engine: &Engine, uploader: &Uploader, part: FilesPart) -> Result<Self> {
+        let Uploader { principal, client } = uploader;
         match part {
-            FilesPart::Header(header) => engine.begin_upload(parse_upload_header(header), client.clone()).await,
+            FilesPart::Header(header) => {
+                engine.begin_upload(parse_upload_header(header), principal, client.clone()).await
+            }
             _ => Err(missing_header()),
         }
     }
@@ -79,10 +92,11 @@ impl StreamedUpload for ArrayUpload {
         request.part
     }
 
-    async fn begin(engine: &Engine, client: &ClientId, part: ArraysPart) -> Result<Self> {
+    async fn begin(engine: &Engine, uploader: &Uploader, part: ArraysPart) -> Result<Self> {
+        let Uploader { principal, client } = uploader;
         match part {
             ArraysPart::Header(header) => {
-                engine.begin_array_upload(parse_array_upload_header(header)?, client.clone()).await
+                engine.begin_array_upload(parse_array_upload_header(header)?, principal, client.clone()).await
             }
             _ => Err(missing_header()),
         }
@@ -105,15 +119,18 @@ impl StreamedUpload for ArrayUpload {
     }
 }
 
-/// Receives all parts of an upload until the client closes its side. On failure, removes the files of the upload.
+/// Receives all parts of an upload of `principal` until the client closes its side. On failure, removes the files of the
+/// upload.
 pub(super) async fn receive_upload<U: StreamedUpload>(
     engine: &Engine,
+    principal: &Arc<Principal>,
     request: Request<Streaming<U::Request>>,
 ) -> Result<U, Status> {
     let connection = ConnectionInfo::of(&request).map_err(to_status)?;
     let client = connection.client(request.metadata()).map_err(to_status)?;
+    let uploader = Uploader { principal: Arc::clone(principal), client };
     let mut upload = None;
-    if let Err(error_status) = receive_parts(engine, &client, request.into_inner(), &mut upload).await {
+    if let Err(error_status) = receive_parts(engine, &uploader, request.into_inner(), &mut upload).await {
         if let Some(upload) = upload {
             // If the removal fails, the next start of the server removes the files.
             tokio::task::spawn_blocking(move || U::discard(upload)).await.ok();
@@ -128,7 +145,7 @@ pub(super) async fn receive_upload<U: StreamedUpload>(
 /// Receives the parts of an upload. After an error the caller discards `upload`.
 async fn receive_parts<U: StreamedUpload>(
     engine: &Engine,
-    client: &ClientId,
+    uploader: &Uploader,
     mut parts: Streaming<U::Request>,
     upload: &mut Option<U>,
 ) -> Result<(), Status> {
@@ -141,7 +158,7 @@ async fn receive_parts<U: StreamedUpload>(
         budget.refill(request.encoded_len());
         let part = U::part_of(request)
             .ok_or_else(|| to_status(Error::UnexpectedMessage { expected: "a part", given: "an empty message" }))?;
-        *upload = Some(receive_part(engine, client, upload.take(), part).await.map_err(to_status)?);
+        *upload = Some(receive_part(engine, uploader, upload.take(), part).await.map_err(to_status)?);
     }
     Ok(())
 }
@@ -149,11 +166,11 @@ async fn receive_parts<U: StreamedUpload>(
 /// Processes one part of an upload. Discards the upload if that fails. Disk access runs on the blocking pool.
 async fn receive_part<U: StreamedUpload>(
     engine: &Engine,
-    client: &ClientId,
+    uploader: &Uploader,
     upload: Option<U>,
     part: U::Part,
 ) -> Result<U> {
-    let Some(mut upload) = upload else { return U::begin(engine, client, part).await };
+    let Some(mut upload) = upload else { return U::begin(engine, uploader, part).await };
     let process_part = move || match upload.add_part(part) {
         Ok(()) => Ok(upload),
         Err(error) => {

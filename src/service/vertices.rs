@@ -9,14 +9,15 @@ use tonic::{Request, Response, Status};
 use v1::get_vertices_response::Part as SinglePart;
 use v1::stream_vertices_response::Part as StreamPart;
 
+use super::caller::Caller;
 use super::convert::{
-    describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, wire_delivery,
-    wire_sections, wire_stages, wire_step_id,
+    describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, right_to_receive,
+    wire_delivery, wire_sections, wire_stages, wire_step_id,
 };
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
-use super::stream::{Deadline, ReplySender, ReplyStream, respond, split_into_chunks};
-use crate::engine::{Engine, OutputSpec, PackedVertices, Subscription, VertexPacker, VertexSelection};
+use super::stream::{Deadline, ReplySender, ReplyStream, respond, run_while_permitted, split_into_chunks};
+use crate::engine::{Engine, OutputSpec, PackedVertices, SceneRight, Subscription, VertexPacker, VertexSelection};
 
 /// Number of domains in one part of a layout. A part then has at most 0.8 MiB.
 const LAYOUT_PART_DOMAINS: usize = 65_536;
@@ -38,8 +39,10 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
+        let scene_handle =
+            self.engine.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (packer, max_chunk_bytes) = (self.engine.vertex_packer().clone(), config.chunk_bytes);
@@ -70,13 +73,16 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
+        let principal = Caller::of(&request)?.principal;
         let request = request.into_inner();
-        let scene_handle = self.engine.find_opened(&request.scene).await.map_err(to_status)?;
-        let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
+        let right = right_to_receive(delivery);
+        let scene_handle = self.engine.find_opened(&request.scene, &principal, right).await.map_err(to_status)?;
+        let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
         let subscription = scene_handle.subscribe(spec, delivery).await.map_err(to_status)?;
+        let right_ended = scene_handle.right_ended(&principal, right);
         let vertex_stream = VertexStream {
             selection,
             packer: self.engine.vertex_packer().clone(),
@@ -85,7 +91,8 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
             max_steps: request.steps,
         };
         Ok(respond(move |reply_sender| {
-            deadline.enforce("the vertex stream", vertex_stream.run(subscription, reply_sender))
+            let work = run_while_permitted(right_ended, vertex_stream.run(subscription, reply_sender));
+            deadline.enforce("the vertex stream", work)
         }))
     }
 }

@@ -11,6 +11,7 @@ use modalcast::engine::{
     Delivery, Engine, FrameOutput, LeaseRequest, OutputBody, OutputSpec, Overflow, PictureSpec, Pixels, SceneHandle,
     StepReport, StepSelector, WriterSession,
 };
+use modalcast::identity::{OWNER, Principal};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::Error;
 use modalcast_model::load::SceneRepository;
@@ -73,7 +74,7 @@ async fn check(expectation: &str) {
     let source = Arc::new(SceneRepository::new(None).expect("expected the built-in scenes"));
     let engine = Engine::start(config.validated().expect("expected valid settings"), source).await;
     let engine = engine.expect("expected a CUDA device");
-    let scene = engine.open("tree", "tree", None).await.expect("expected the tree");
+    let scene = engine.open("tree", "tree", &Principal::owner(), None).await.expect("expected the tree");
     let mut writer = acquire_writer(&scene).await;
     let rest = output(&scene).await;
     assert_eq!(send(&mut writer, &scene, 1, 0.5).await, None);
@@ -109,6 +110,7 @@ async fn check(expectation: &str) {
 
 async fn acquire_writer(scene: &SceneHandle) -> WriterSession {
     let request = LeaseRequest {
+        principal: OWNER.into(),
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window: 1,

@@ -3,6 +3,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use modalcast::identity::Principal;
 use modalcast_client::{ArrayUpload, Client, Reason, UploadDomain, UploadShape};
 use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
@@ -288,5 +289,5 @@ async fn invalid_arrays_are_rejected_and_leave_no_files() {
     let rejection = error.rejection().expect("expected details");
     assert_eq!(rejection.to_string(), "domains[0]: expected 120 bytes, got 84 bytes");
     let left = std::fs::read_dir(folder.path().join("state/uploads")).expect("expected an uploads folder").count();
-    assert_eq!((left, server.engine.list().open.len()), (0, 0));
+    assert_eq!((left, server.engine.list(&Principal::owner()).open.len()), (0, 0));
 }

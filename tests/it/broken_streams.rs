@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::ShapeArray;
+use modalcast::identity::Principal;
 use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
@@ -310,7 +311,7 @@ async fn break_upload<T, F>(
     drop(sender);
     let info = with_timeout(upload(server.channel().await, ReceiverStream::new(requests))).await;
     assert_eq!(info.expect("expected the whole upload to succeed").vertices, 3);
-    with_timeout(server.engine.close("up")).await.expect("expected the scene to close");
+    with_timeout(server.engine.close("up", &Principal::owner())).await.expect("expected the scene to close");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -108,7 +108,7 @@ async fn readers_learn_why_nothing_receives_forces() {
     let request = || v1::StreamForcesRequest { scene: "strips".into(), max_hz: 0.0, passive: true };
     let mut reader = with_timeout(client.force_messages(request())).await.expect("expected a subscription");
     assert_eq!(next_receiver_error(&mut reader).await, "");
-    let scene_handle = server.engine.find_opened("strips").await.expect("expected the scene");
+    let scene_handle = server.engine.find("strips").expect("expected the scene");
     scene_handle.set_receiver_error("diverged");
     assert_eq!(next_receiver_error(&mut reader).await, "diverged");
     let mut late_reader = with_timeout(client.force_messages(request())).await.expect("expected a subscription");

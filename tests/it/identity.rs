@@ -14,35 +14,46 @@ use v1::state_service_client::StateServiceClient;
 
 use crate::service_harness::{Server, rejection_details, with_timeout};
 
-/// The token of the principal with each role.
-fn token_of(role: Role) -> String {
-    format!("token-of-{}", role.name())
+/// The token of the principal with this name.
+pub fn token_of_name(name: &str) -> String {
+    format!("token-of-{name}")
 }
 
-/// A file with one principal per role.
+/// The token of the principal with each role.
+fn token_of(role: Role) -> String {
+    token_of_name(role.name())
+}
+
+/// Writes a file with one principal per role.
 fn write_principals(path: &Path, roles: &[Role]) {
-    let entry = |role: &Role| {
-        let (name, hash) = (role.name(), TokenHash::of(&token_of(*role)).expect("expected a token"));
-        format!("[[principal]]\nname = '{name}'\nrole = '{name}'\n[[principal.token]]\nsha256 = '{hash}'\n")
+    write_named_principals(path, &roles.iter().map(|role| (role.name(), *role)).collect::<Vec<_>>());
+}
+
+/// Writes a file of principals with these names and roles.
+pub fn write_named_principals(path: &Path, principals: &[(&str, Role)]) {
+    let entry = |(name, role): &(&str, Role)| {
+        let (role, hash) = (role.name(), TokenHash::of(&token_of_name(name)).expect("expected a token"));
+        format!("[[principal]]\nname = '{name}'\nrole = '{role}'\n[[principal.token]]\nsha256 = '{hash}'\n")
     };
     // Replaced at once, so that the server never reads a part of it.
     let new = path.with_extension("new");
-    std::fs::write(&new, roles.iter().map(entry).collect::<String>()).expect("expected a writable folder");
+    std::fs::write(&new, principals.iter().map(entry).collect::<String>()).expect("expected a writable folder");
     std::fs::rename(&new, path).expect("expected a writable folder");
 }
 
 /// A server that identifies its callers.
-struct GuardedServer {
-    server: Server,
+pub struct GuardedServer {
+    pub server: Server,
     folder: tempfile::TempDir,
 }
 
 impl GuardedServer {
+    /// A server with one principal per role.
     async fn start() -> Self {
         Self::start_with(|config| config).await
     }
 
-    async fn start_with(change: impl FnOnce(Config) -> Config) -> Self {
+    pub async fn start_with(change: impl FnOnce(Config) -> Config) -> Self {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let principals = folder.path().join("principals.toml");
         write_principals(&principals, &Role::ALL);
@@ -65,12 +76,12 @@ impl GuardedServer {
         self.folder.path().join("sockets").join(format!("{port}.sock"))
     }
 
-    async fn channel(&self) -> Channel {
+    pub async fn channel(&self) -> Channel {
         self.server.channel().await
     }
 }
 
-fn with_token<T>(message: T, token: Option<&str>) -> Request<T> {
+pub fn with_token<T>(message: T, token: Option<&str>) -> Request<T> {
     let mut request = Request::new(message);
     if let Some(token) = token {
         let value = format!("Bearer {token}").parse().expect("expected a metadata value");
@@ -120,17 +131,18 @@ async fn every_method_is_permitted_from_its_role_on() {
         let minimum = Role::ALL.iter().position(|role| role.name() == required);
         assert_eq!(minimum.is_none(), required == "nothing", "{method}: {required}");
         for (index, role) in Role::ALL.iter().enumerate() {
-            let status = call_with_an_empty_message(&channel, method, Some(&token_of(*role))).await;
+            let status = call(&channel, method, &[], Some(&token_of(*role))).await;
             let is_denied = status.code() == Code::PermissionDenied;
             assert_eq!(is_denied, minimum.is_some_and(|minimum| index < minimum), "{method} as {role:?}: {status:?}");
         }
-        let status = call_with_an_empty_message(&channel, method, None).await;
+        let status = call(&channel, method, &[], None).await;
         assert_eq!(status.code() == Code::Unauthenticated, minimum.is_some(), "{method}: {status:?}");
     }
 }
 
-/// The status with which the call ends within a short time, or `OK` for one that goes on.
-async fn call_with_an_empty_message(channel: &Channel, method: &str, token: Option<&str>) -> Status {
+/// Calls a method with one message. Returns the status with which the call ends within a short time, or `OK` for one that
+/// goes on.
+pub async fn call(channel: &Channel, method: &str, message: &[u8], token: Option<&str>) -> Status {
     use http_body::Body as _;
     use tonic::codegen::{Service as _, http};
     let mut request = http::Request::post(format!("http://server/{method}"))
@@ -139,8 +151,9 @@ async fn call_with_an_empty_message(channel: &Channel, method: &str, token: Opti
     if let Some(token) = token {
         request = request.header("authorization", format!("Bearer {token}"));
     }
-    let message = bytes::Bytes::from_static(&[0; 5]);
-    let request = request.body(tonic::body::Body::new(http_body_util::Full::new(message))).expect("expected a request");
+    let prefix = [&[0][..], &(message.len() as u32).to_be_bytes()].concat();
+    let body = http_body_util::Full::new(bytes::Bytes::from([&prefix, message].concat()));
+    let request = request.body(tonic::body::Body::new(body)).expect("expected a request");
     let mut channel = channel.clone();
     std::future::poll_fn(|cx| channel.poll_ready(cx)).await.expect("expected an open connection");
     let response = with_timeout(channel.call(request)).await.expect("expected a response");
@@ -203,6 +216,7 @@ async fn revoked_token_ends_its_streams() {
     let guarded = GuardedServer::start().await;
     let owner = Client::connect(&format!("unix:{}", guarded.socket().display())).await.expect("expected a connection");
     owner.open_scene("strips", "").await.expect("expected a scene");
+    owner.share_scene("strips", &["*"]).await.expect("expected a shared scene");
     let mut streams = Vec::new();
     for role in [Role::View, Role::Drive] {
         let delivery = v1::Delivery::Latest.into();

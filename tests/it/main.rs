@@ -37,6 +37,8 @@ mod plants;
 mod raster;
 mod real;
 mod restart;
+mod scene_rights;
+
 #[path = "../gpu/scenes.rs"]
 mod scenes;
 mod server_process;

@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use modalcast::identity::Principal;
 use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
 use v1::upload_scene_request::Part;
@@ -138,7 +139,7 @@ fn catalog_write_failure_fails_the_call() {
         assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");
         let status = scenes.open_scene(open_request("sheet")).await.expect_err("expected the opening to fail");
         assert_eq!(status.code(), tonic::Code::Internal, "{status:?}");
-        assert!(server.engine.list().open.is_empty());
+        assert!(server.engine.list(&Principal::owner()).open.is_empty());
         std::fs::remove_dir(&obstacle).expect("expected to remove the folder");
         scenes.delete_scene(delete_request()).await.expect("expected the deletion to succeed");
         let status = scenes.delete_scene(delete_request()).await.expect_err("expected an unknown-scene error");
@@ -171,7 +172,8 @@ fn restart_restores_uploads_but_not_deleted_scenes() {
     });
     runtime().block_on(async {
         let server = Server::start(config(folder.path())).await;
-        let names: Vec<_> = server.engine.list().open.iter().map(|scene| scene.name.clone()).collect();
+        let names: Vec<_> =
+            server.engine.list(&Principal::owner()).open.iter().map(|scene| scene.name.clone()).collect();
         assert_eq!(names, ["mine"]);
         assert!(!folder.path().join("steps/strips.step").exists());
         get_vertices(&server, vertex_request("mine")).await.expect("expected vertices");

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use modalcast::engine::{SceneSource, StoredUpload};
+use modalcast::identity::Principal;
 use modalcast_model::error::Result;
 use modalcast_model::load::OpenedScene;
 use modalcast_model::memory::MemoryReservation;
@@ -51,7 +52,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
     let open = || {
         let engine = server.engine.clone();
-        tokio::spawn(async move { engine.open("strips", "", None).await })
+        tokio::spawn(async move { engine.open("strips", "", &Principal::owner(), None).await })
     };
     let first_opening = open();
     // The second opening starts while the first one is in the loader. It has 50 ms to arrive before the first one
@@ -65,8 +66,12 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     assert!(with_timeout(first_opening).await.expect("expected the task not to panic").is_err());
     with_timeout(second_opening).await.expect("expected the task not to panic").expect("expected the scene to open");
     server.engine.find("strips").expect("expected an open scene");
-    server.engine.close("strips").await.expect("expected the scene to close");
-    server.engine.open("other", "strips", None).await.expect("expected the name to be free after closing");
+    server.engine.close("strips", &Principal::owner()).await.expect("expected the scene to close");
+    server
+        .engine
+        .open("other", "strips", &Principal::owner(), None)
+        .await
+        .expect("expected the name to be free after closing");
 }
 
 /// A description of all domains of a scene.

@@ -4,6 +4,7 @@
 use std::path::Path;
 use std::sync::Arc;
 
+use modalcast::identity::Principal;
 use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
 use sha2::{Digest as _, Sha256};
@@ -166,7 +167,7 @@ async fn invalid_files_are_rejected_and_leave_no_files() {
             "{name}"
         );
     }
-    assert!(server.engine.list().open.is_empty());
+    assert!(server.engine.list(&Principal::owner()).open.is_empty());
     upload(&server, "", &[("a.obj", square)]).await.expect("expected the upload to succeed after rejected ones");
 }
 

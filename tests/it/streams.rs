@@ -7,6 +7,7 @@ use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{
     Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepFrames, StepOutput,
 };
+use modalcast::identity::Principal;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::scene::{Camera, CameraSource, FrameSize, FrameStyle, Lens};
 use modalcast_proto::v1;
@@ -205,7 +206,7 @@ async fn closing_a_scene_delivers_frames_in_flight() {
     let expected_images = reference_images(&cameras);
     let output = with_timeout(subscription.next()).await.expect("expected a frame");
     assert!(frame_bytes(&output).await == expected_images[0].images[0]);
-    with_timeout(server.engine.close("attributes")).await.expect("expected the scene to close");
+    with_timeout(server.engine.close("attributes", &Principal::owner())).await.expect("expected the scene to close");
     // The subscription ends after the frames of some of the 12 steps. No frame is missing in between.
     let mut number = 1;
     while let Ok(output) = with_timeout(subscription.next()).await {

@@ -217,6 +217,18 @@ impl Client {
         self.reply(self.scenes().delete_scene(request).await).map(drop)
     }
 
+    /// Shares a scene with the principals of these names (`"*"`: all), in place of those with whom it was shared. Others
+    /// than its owner do not see a scene that is not shared.
+    ///
+    /// # Errors
+    /// `Status` if the scene does not exist, belongs to another principal or a name is malformed; `Connect` if the
+    /// connection is lost.
+    pub async fn share_scene(&self, scene: &str, principals: &[&str]) -> Result<()> {
+        let principals = principals.iter().map(|name| (*name).to_owned()).collect();
+        let request = v1::ShareSceneRequest { scene: scene.to_owned(), principals };
+        self.reply(self.scenes().share_scene(request).await).map(drop)
+    }
+
     /// Returns a scene to its rest state. `take_over` replaces the writer that drives the scene. Returns the step that
     /// shows the rest state.
     ///

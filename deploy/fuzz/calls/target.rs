@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use modalcast::config::{Authentication, BackendChoice, Config, ListenAddress, RendererChoice};
 use modalcast::engine::Engine;
+use modalcast::identity::Principal;
 use modalcast::service;
 use modalcast_model::load::SceneRepository;
 use modalcast_proto::v1;
@@ -134,8 +135,8 @@ impl CallTarget {
             let rejection = self.send(self.call, messages).await;
             let reason = rejection.as_ref().map(v1::Rejection::reason);
             assert_ne!(reason, Some(v1::Reason::Internal), "{rejection:?}");
-            for scene in self.engine.list().open.iter().filter(|scene| scene.name != STORED_SCENE) {
-                self.engine.close(&scene.name).await.expect("expected a scene that closes");
+            for scene in self.engine.list(&Principal::owner()).open.iter().filter(|scene| scene.name != STORED_SCENE) {
+                self.engine.close(&scene.name, &Principal::owner()).await.expect("expected a scene that closes");
             }
             self.wait_for_removal().await;
             rejection.is_none()

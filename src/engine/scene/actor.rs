@@ -81,10 +81,17 @@ pub(super) struct ActorParams {
     pub memory: SceneMemory,
 }
 
+/// Identifies a writer across connections.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct WriterId {
+    principal: String,
+    token: LeaseToken,
+}
+
 /// The current writer of a scene.
 struct Writer {
     step_queue: Arc<StepQueue>,
-    token: LeaseToken,
+    id: WriterId,
     acquired_at: Instant,
 }
 
@@ -139,8 +146,8 @@ pub(super) struct SceneActor {
     /// Whether the next step starts from the rest state instead of the current one.
     starts_from_rest: bool,
     writer: Option<Writer>,
-    /// The token of the latest writer, whether it is still connected or not.
-    last_token: Option<LeaseToken>,
+    /// The latest writer, whether it is still connected or not.
+    last_writer: Option<WriterId>,
     phase: StepPhase,
     /// A step that was taken from the queue of the writer early.
     next_step: Option<NextStep>,
@@ -172,7 +179,7 @@ impl SceneActor {
             run: state.run,
             starts_from_rest: false,
             writer: None,
-            last_token: None,
+            last_writer: None,
             phase: StepPhase::Idle,
             next_step: None,
             current: CurrentStep::of_opened_scene(state),
@@ -330,37 +337,38 @@ impl SceneActor {
     }
 
     /// Admits one writer at a time. A new writer replaces the present one if the queue of the present one is closed, if
-    /// both have the same token, or if the new writer requests the takeover.
+    /// both have the same principal and token, or if the new writer requests the takeover.
     ///
     /// # Errors
     /// `LeaseTaken`; `Fault` when the run or the token cannot be created. The present writer then keeps the lease.
     async fn acquire_writer(&mut self, request: LeaseRequest) -> Result<AcquiredLease> {
-        let LeaseRequest { delivery, overflow, window, token, takes_over, initial_state } = request;
+        let LeaseRequest { principal, delivery, overflow, window, token, takes_over, initial_state } = request;
+        let id = WriterId { principal, token: token.map_or_else(LeaseToken::random, Ok)? };
         let present_writer = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed());
         if let Some(writer) = present_writer
             && !takes_over
-            && token.as_ref() != Some(&writer.token)
+            && id != writer.id
         {
             return Err(Error::LeaseTaken { run: self.run, seconds: writer.acquired_at.elapsed().as_secs() });
         }
-        let token = token.map_or_else(LeaseToken::random, Ok)?;
         let run_counter = Arc::clone(&self.run_counter);
         let run = run_blocking("counter of runs", move || run_counter.next()).await?;
         if let Some(writer) = &self.writer {
             writer.step_queue.end(Error::LeaseLost { run });
         }
         self.run = run;
-        let is_resumed = self.last_token.as_ref() == Some(&token);
+        let is_resumed = self.last_writer.as_ref() == Some(&id);
         self.starts_from_rest = match initial_state {
             Some(initial_state) => initial_state == InitialState::Reset,
             // A resumed run that has not sent a step yet begins as it would have without the interruption.
             None => !is_resumed || self.starts_from_rest,
         };
         let initial_state = if self.starts_from_rest { InitialState::Reset } else { InitialState::Keep };
-        self.last_token = Some(token.clone());
+        self.last_writer = Some(id.clone());
         let step_queue = Arc::new(StepQueue::new(delivery, overflow, window, Arc::clone(&self.wake)));
         let (acquired_at, lease) = (Instant::now(), WriterLease { step_queue: Arc::clone(&step_queue) });
-        self.writer = Some(Writer { step_queue, token: token.clone(), acquired_at });
+        let token = id.token.clone();
+        self.writer = Some(Writer { step_queue, id, acquired_at });
         Ok(AcquiredLease { lease, token, run, initial_state })
     }
 

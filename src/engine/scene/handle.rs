@@ -21,6 +21,8 @@ use crate::engine::output::step_output::{StepId, StepOutput};
 use crate::engine::scene_memory::SceneMemory;
 use crate::engine::storage::checkpoint_store::SceneCheckpoints;
 use crate::engine::storage::provenance::SceneProvenance;
+use crate::engine::storage::scene_record::{SceneAccess, SceneRight, SharedAccess};
+use crate::identity::Principal;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::error::{Error, Result, invalid};
@@ -37,6 +39,7 @@ const MAILBOX_CAPACITY: usize = 128;
 pub struct SceneHandle {
     pub name: String,
     pub provenance: SceneProvenance,
+    access: SharedAccess,
     pub scene: Arc<Scene>,
     id: SceneId,
     /// The reason why no frame can be drawn. `None` if frames can be drawn.
@@ -63,6 +66,7 @@ pub struct SceneHandle {
 pub(in crate::engine) struct OpenParams {
     pub name: String,
     pub provenance: SceneProvenance,
+    pub access: SharedAccess,
     pub scene: Arc<Scene>,
     pub backends: BackendSettings,
     pub id: SceneId,
@@ -82,7 +86,7 @@ impl SceneHandle {
     /// # Errors
     /// `Fault` of the device, `Invalid` when the rest state overflows, `Busy` when the command queue is full.
     pub(in crate::engine) async fn open(params: OpenParams, services: SceneServices) -> Result<Self> {
-        let OpenParams { name, provenance, scene, backends, id, on_failure, state, frames_unavailable, memory } =
+        let OpenParams { name, provenance, access, scene, backends, id, on_failure, state, frames_unavailable, memory } =
             params;
         services.device.name_scene(id, &name);
         services.device.load_scene(id, &scene, backends).await?;
@@ -117,6 +121,7 @@ impl SceneHandle {
         Ok(Self {
             name,
             provenance,
+            access,
             scene,
             id,
             frames_unavailable,
@@ -145,6 +150,32 @@ impl SceneHandle {
         self.content_hashes.get_or_try_init(compute).await.cloned()
     }
 
+    /// Who may use the scene.
+    pub fn access(&self) -> SceneAccess {
+        self.access.borrow().clone()
+    }
+
+    /// Waits until a principal no longer has a right to the scene, and returns the error. Cancel-safe. The future does not
+    /// keep the scene open.
+    pub fn right_ended(
+        &self,
+        principal: &Arc<Principal>,
+        right: SceneRight,
+    ) -> impl Future<Output = Error> + Send + use<> {
+        let (mut access, principal, name) = (self.access.subscribe(), Arc::clone(principal), self.name.clone());
+        async move {
+            loop {
+                if let Err(error) = access.borrow_and_update().check(&name, &principal, right) {
+                    return error;
+                }
+                if access.changed().await.is_err() {
+                    // The scene is closed, which ends its streams.
+                    std::future::pending::<()>().await;
+                }
+            }
+        }
+    }
+
     /// The last completed step, if there is one.
     pub fn last_step(&self) -> Option<StepId> {
         let state = self.current_state.borrow();
@@ -165,10 +196,10 @@ impl SceneHandle {
     /// closed; `Busy` when the mailbox is full; `Fault` when the run cannot be written to disk.
     pub async fn drive(&self, peer: &str, request: LeaseRequest) -> Result<WriterSession> {
         let request = LeaseRequest { window: request.window.clamp(1, self.max_window), ..request };
-        let (delivery, window) = (request.delivery, request.window);
+        let (delivery, window, principal) = (request.delivery, request.window, request.principal.clone());
         let AcquiredLease { lease, token, run, initial_state } =
             self.call(|reply| Message::AcquireWriter { request, reply }).await?;
-        tracing::info!(scene = self.name, run, peer, ?delivery, ?initial_state, "driven by a new writer");
+        tracing::info!(scene = self.name, run, principal, peer, ?delivery, ?initial_state, "driven by a new writer");
         let (scene, checkpoints) = (Arc::clone(&self.scene), self.checkpoints.clone());
         Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None, checkpoints })
     }
@@ -178,8 +209,9 @@ impl SceneHandle {
     ///
     /// # Errors
     /// Those of [`Self::drive`] and of the step.
-    pub async fn reset(&self, peer: &str, takes_over: bool) -> Result<StepId> {
+    pub async fn reset(&self, peer: &str, principal: &str, takes_over: bool) -> Result<StepId> {
         let request = LeaseRequest {
+            principal: principal.to_owned(),
             // Does not wait for lossless readers, so that a stalled one cannot block the call.
             delivery: Delivery::Latest,
             overflow: Overflow::Block,

@@ -63,6 +63,8 @@ pub enum InitialState {
 /// What a writer asks for when it opens its stream.
 #[derive(Debug, Clone)]
 pub struct LeaseRequest {
+    /// Name of the principal that drives. A token identifies a writer only together with it.
+    pub principal: String,
     pub delivery: Delivery,
     pub overflow: Overflow,
     /// Number of steps that may be unacknowledged.

@@ -185,6 +185,11 @@ impl OpenArrays {
 }
 
 impl ArrayUpload {
+    /// The name of the scene.
+    pub fn scene(&self) -> &str {
+        &self.header.scene
+    }
+
     /// Creates a temporary folder next to the finished uploads. The arrays of a domain are in `memory` until they are on
     /// disk.
     ///

@@ -16,11 +16,13 @@ use super::file_system::{DiskFileSystem, FileSystem, StateFile, paths_below};
 use super::provenance::SceneProvenance;
 use super::run_counter::RunCounter;
 use super::scene_catalog::SceneCatalog;
+use super::scene_record::{SceneAccess, SceneRecord};
 use super::upload::{CompleteUpload, Upload, UploadHeader};
 use crate::config::Config;
 use crate::engine::lock::lock;
 use crate::engine::testing;
 use crate::engine::upload_quota::{ClientId, UploadPermit, UploadQuota};
+use crate::identity::Principal;
 use modalcast_model::domain::Transform;
 use modalcast_model::memory::MemoryReservation;
 use modalcast_model::scene::{Scene, SceneState, UpAxis};
@@ -309,9 +311,13 @@ impl Recorder {
 
     fn open_repository_scene(&mut self, name: &str) {
         let provenance = SceneProvenance::Repository { source: "strips".into() };
-        self.catalog.add(name, &provenance).expect("expected a written catalog");
+        self.catalog.add(name, &Self::own_record(provenance)).expect("expected a written catalog");
         self.acknowledged.scenes.insert(name.into(), BTreeMap::new());
         self.acknowledge();
+    }
+
+    fn own_record(provenance: SceneProvenance) -> SceneRecord {
+        SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) }
     }
 
     fn permit() -> UploadPermit {
@@ -324,8 +330,8 @@ impl Recorder {
         let header =
             UploadHeader { scene: name.into(), entry: files[0].0.into(), files: files.len() as u32, total_bytes };
         let uploads = self.catalog.uploads();
-        let mut upload =
-            Upload::begin(&uploads, &self.file_system, header, Self::permit()).expect("expected a temporary folder");
+        let mut upload = Upload::begin(&uploads, &self.file_system, header, Self::permit(), vec![])
+            .expect("expected a temporary folder");
         for (path, text) in files {
             let sha256 = Sha256::digest(text.as_bytes());
             upload.begin_file(path, text.len() as u64, &sha256).expect("expected a new file");
@@ -371,7 +377,9 @@ impl Recorder {
         let entry = upload.entry.clone();
         let folder = self.catalog.upload_folder(name);
         upload.commit(&folder).expect("expected a moved folder");
-        self.catalog.add(name, &SceneProvenance::Upload { entry }).expect("expected a written catalog");
+        self.catalog
+            .add(name, &Self::own_record(SceneProvenance::Upload { entry }))
+            .expect("expected a written catalog");
         self.acknowledged.scenes.insert(name.into(), read_files(&folder));
         self.acknowledge();
     }

@@ -11,6 +11,7 @@ pub(super) mod provenance;
 mod recovery;
 pub(super) mod run_counter;
 pub(super) mod scene_catalog;
+pub(super) mod scene_record;
 pub(super) mod upload;
 mod upload_folder;
 pub(super) mod upload_record;

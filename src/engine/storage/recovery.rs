@@ -11,17 +11,20 @@ use sha2::{Digest as _, Sha256};
 
 use super::file_system::{FileSystem, write_atomic};
 use super::provenance::{SceneProvenance, validate_scene_name};
+use super::scene_record::{SceneAccess, SceneRecord};
 use super::upload_record::UploadRecord;
 use crate::engine::content::hex;
+use crate::identity::Principal;
 
 /// The scenes of a state folder by name.
-type Entries = BTreeMap<String, SceneProvenance>;
+type Entries = BTreeMap<String, SceneRecord>;
 
-/// Where a scene comes from, in a file of its own, so that a damaged catalog can be rebuilt.
+/// The record of a scene in a file of its own, so that a damaged catalog can be rebuilt.
 #[derive(Debug, serde::Serialize, serde::Deserialize)]
-struct SourceRecord {
-    provenance: SceneProvenance,
-    /// Hash of the provenance as JSON.
+struct HashedRecord {
+    #[serde(rename = "provenance")]
+    record: SceneRecord,
+    /// Hash of the record as JSON.
     sha256: String,
 }
 
@@ -44,7 +47,7 @@ impl StatePaths {
         self.folder.join("steps")
     }
 
-    /// The folder of the records of the scenes' sources.
+    /// The folder of the records of single scenes.
     pub(super) fn sources(&self) -> PathBuf {
         self.folder.join("sources")
     }
@@ -54,14 +57,14 @@ impl StatePaths {
     }
 }
 
-/// Writes the source of a scene.
-pub(super) fn write_source(file_system: &dyn FileSystem, path: &Path, provenance: &SceneProvenance) -> io::Result<()> {
-    let record = SourceRecord { provenance: provenance.clone(), sha256: hash_provenance(provenance)? };
+/// Writes the record of a scene.
+pub(super) fn write_record(file_system: &dyn FileSystem, path: &Path, record: &SceneRecord) -> io::Result<()> {
+    let record = HashedRecord { record: record.clone(), sha256: hash_record(record)? };
     write_atomic(file_system, path, &serde_json::to_vec_pretty(&record)?)
 }
 
-fn hash_provenance(provenance: &SceneProvenance) -> io::Result<String> {
-    Ok(hex(&Sha256::digest(serde_json::to_vec(provenance)?)))
+fn hash_record(record: &SceneRecord) -> io::Result<String> {
+    Ok(hex(&Sha256::digest(serde_json::to_vec(record)?)))
 }
 
 /// The recovery of one state folder.
@@ -74,7 +77,7 @@ impl Recovery<'_> {
     /// Recovers the folder. Returns the scenes to open.
     pub(super) fn run(&self) -> io::Result<Entries> {
         let listed = self.read_catalog()?;
-        let mut entries = listed.clone().unwrap_or_else(|| self.read_sources());
+        let mut entries = listed.clone().unwrap_or_else(|| self.read_records());
         self.recover_uploads(&mut entries);
         self.remove_entries_without_files(&mut entries);
         self.remove_leftovers(&entries);
@@ -103,19 +106,19 @@ impl Recovery<'_> {
         }
     }
 
-    /// The scenes whose source is recorded.
-    fn read_sources(&self) -> Entries {
+    /// The scenes that have a record.
+    fn read_records(&self) -> Entries {
         let mut entries = Entries::new();
         for name in names_in(&self.paths.sources()) {
             let Some(scene) = name.to_str().and_then(|name| name.strip_suffix(".json")) else { continue };
             let bytes = fs::read(self.paths.source(scene)).unwrap_or_default();
-            let record = serde_json::from_slice::<SourceRecord>(&bytes).ok();
-            let provenance = record
-                .filter(|record| hash_provenance(&record.provenance).is_ok_and(|hash| hash == record.sha256))
-                .map(|record| record.provenance);
-            match (validate_scene_name(scene), provenance) {
-                (Ok(scene), Some(provenance)) => drop(entries.insert(scene.to_owned(), provenance)),
-                _ => tracing::warn!(scene, "the record of the scene's source is damaged; the scene is not opened"),
+            let hashed = serde_json::from_slice::<HashedRecord>(&bytes).ok();
+            let record = hashed
+                .filter(|hashed| hash_record(&hashed.record).is_ok_and(|hash| hash == hashed.sha256))
+                .map(|hashed| hashed.record);
+            match (validate_scene_name(scene), record) {
+                (Ok(scene), Some(record)) => drop(entries.insert(scene.to_owned(), record)),
+                _ => tracing::warn!(scene, "the record of the scene is damaged; the scene is not opened"),
             }
         }
         entries
@@ -127,14 +130,17 @@ impl Recovery<'_> {
         for name in names_in(&self.paths.uploads()) {
             let folder = self.paths.uploads().join(&name);
             let scene = name.to_str().and_then(|name| validate_scene_name(name).ok());
-            if scene.is_some_and(|scene| matches!(entries.get(scene), Some(SceneProvenance::Upload { .. }))) {
+            if scene.is_some_and(|scene| entries.get(scene).is_some_and(SceneRecord::is_upload)) {
                 continue;
             }
             let record = UploadRecord::read(&folder).filter(|record| record.matches(&folder));
             match (scene, record) {
                 (Some(scene), Some(record)) if !entries.contains_key(scene) => {
                     tracing::warn!(scene, "an upload without an entry in scenes.json is adopted");
-                    entries.insert(scene.to_owned(), SceneProvenance::Upload { entry: record.entry });
+                    // Nothing tells who has uploaded the files, so that only the user of the server gets them.
+                    let access = SceneAccess::new(&Principal::owner());
+                    let provenance = SceneProvenance::Upload { entry: record.entry };
+                    entries.insert(scene.to_owned(), SceneRecord { provenance, access });
                 }
                 _ => {
                     if let Some(scene) = scene {
@@ -148,9 +154,8 @@ impl Recovery<'_> {
 
     /// Removes the entries of uploads without a folder.
     fn remove_entries_without_files(&self, entries: &mut Entries) {
-        entries.retain(|scene, provenance| {
-            let is_lost =
-                matches!(provenance, SceneProvenance::Upload { .. }) && !self.paths.uploads().join(scene).is_dir();
+        entries.retain(|scene, record| {
+            let is_lost = record.is_upload() && !self.paths.uploads().join(scene).is_dir();
             if is_lost {
                 tracing::warn!(scene, "the files of an uploaded scene do not exist; its entry is removed");
             }
@@ -158,7 +163,7 @@ impl Recovery<'_> {
         });
     }
 
-    /// Removes steps and sources of scenes that are not open, and temporary files.
+    /// Removes steps and records of scenes that are not open, and temporary files.
     fn remove_leftovers(&self, entries: &Entries) {
         for (folder, ending) in [(self.paths.steps(), ".step"), (self.paths.sources(), ".json")] {
             for name in names_in(&folder) {

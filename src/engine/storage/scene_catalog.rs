@@ -6,18 +6,18 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard};
 
 use super::file_system::{FileSystem, make_private, write_atomic};
-use super::provenance::SceneProvenance;
-use super::recovery::{Recovery, StatePaths, write_source};
+use super::recovery::{Recovery, StatePaths, write_record};
+use super::scene_record::{SceneAccess, SceneRecord};
 use crate::engine::lock::lock;
 use modalcast_model::error::{Error, Result, fault_in};
 
-/// The names and provenances of the open scenes, written to disk at every change. A second file for each scene has its
-/// provenance, too, so that a damaged catalog can be rebuilt.
+/// The names and records of the open scenes, written to disk at every change. A second file for each scene has its record,
+/// too, so that a damaged catalog can be rebuilt.
 #[derive(Debug)]
 pub(in crate::engine) struct SceneCatalog {
     file_system: Arc<dyn FileSystem>,
     paths: StatePaths,
-    entries: Mutex<BTreeMap<String, SceneProvenance>>,
+    entries: Mutex<BTreeMap<String, SceneRecord>>,
     /// File lock of the server that uses the folder. The operating system releases it when the process dies.
     folder_lock: Mutex<Option<File>>,
 }
@@ -47,18 +47,28 @@ impl SceneCatalog {
         Ok(Self { file_system: Arc::clone(file_system), paths, entries, folder_lock })
     }
 
-    pub(in crate::engine) fn entries(&self) -> BTreeMap<String, SceneProvenance> {
+    pub(in crate::engine) fn entries(&self) -> BTreeMap<String, SceneRecord> {
         self.lock_entries().clone()
     }
 
+    pub(in crate::engine) fn find(&self, name: &str) -> Option<SceneRecord> {
+        self.lock_entries().get(name).cloned()
+    }
+
     /// Adds a scene and writes the catalog. A failure leaves the catalog unchanged.
-    pub(in crate::engine) fn add(&self, name: &str, provenance: &SceneProvenance) -> Result<()> {
-        let source = self.paths.source(name);
-        if self.lock_entries().get(name) == Some(provenance) && source.exists() {
+    pub(in crate::engine) fn add(&self, name: &str, record: &SceneRecord) -> Result<()> {
+        let path = self.paths.source(name);
+        if self.lock_entries().get(name) == Some(record) && path.exists() {
             return Ok(());
         }
-        write_source(&*self.file_system, &source, provenance).map_err(fault_in("writing the source of a scene"))?;
-        self.change_entries(|entries| entries.insert(name.to_owned(), provenance.clone())).map(drop)
+        write_record(&*self.file_system, &path, record).map_err(fault_in("writing the record of a scene"))?;
+        self.change_entries(|entries| entries.insert(name.to_owned(), record.clone())).map(drop)
+    }
+
+    /// Changes who may use a scene of the catalog, and writes the catalog. Does nothing for other scenes.
+    pub(in crate::engine) fn set_access(&self, name: &str, access: SceneAccess) -> Result<()> {
+        let Some(record) = self.find(name) else { return Ok(()) };
+        self.add(name, &SceneRecord { access, ..record })
     }
 
     /// Removes the uploaded files of a scene, and then the scene from the catalog. Returns whether the scene was listed. A
@@ -83,8 +93,15 @@ impl SceneCatalog {
 
     /// The sizes in bytes of all uploads, by the names of their scenes.
     pub(in crate::engine) fn stored_uploads(&self) -> BTreeMap<String, u64> {
-        let uploads = self.entries().into_iter().filter(|(_, source)| matches!(source, SceneProvenance::Upload { .. }));
+        let uploads = self.entries().into_iter().filter(|(_, record)| record.is_upload());
         uploads.map(|(name, _)| (name.clone(), folder_bytes(&self.upload_folder(&name)))).collect()
+    }
+
+    /// The folders of the uploads that belong to a principal.
+    pub(in crate::engine) fn upload_folders_of(&self, owner: &str) -> Vec<PathBuf> {
+        let entries = self.lock_entries();
+        let own = entries.iter().filter(|(_, record)| record.is_upload() && record.access.owner == owner);
+        own.map(|(name, _)| self.upload_folder(name)).collect()
     }
 
     pub(in crate::engine) const fn file_system(&self) -> &Arc<dyn FileSystem> {
@@ -115,7 +132,7 @@ impl SceneCatalog {
     }
 
     /// Changes the catalog on disk, and in memory only if that succeeds, so that both agree.
-    fn change_entries<T>(&self, change: impl FnOnce(&mut BTreeMap<String, SceneProvenance>) -> T) -> Result<T> {
+    fn change_entries<T>(&self, change: impl FnOnce(&mut BTreeMap<String, SceneRecord>) -> T) -> Result<T> {
         let mut entries = self.lock_entries();
         let mut changed_entries = entries.clone();
         let result = change(&mut changed_entries);
@@ -125,7 +142,7 @@ impl SceneCatalog {
         Ok(result)
     }
 
-    fn lock_entries(&self) -> MutexGuard<'_, BTreeMap<String, SceneProvenance>> {
+    fn lock_entries(&self) -> MutexGuard<'_, BTreeMap<String, SceneRecord>> {
         lock(&self.entries)
     }
 }
@@ -148,7 +165,17 @@ impl Drop for SceneCatalog {
 #[cfg(test)]
 mod tests {
     use super::super::file_system::DiskFileSystem;
+    use super::super::provenance::SceneProvenance;
     use super::*;
+    use crate::identity::Principal;
+
+    fn record(provenance: SceneProvenance) -> SceneRecord {
+        SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) }
+    }
+
+    fn strips() -> SceneRecord {
+        record(SceneProvenance::Repository { source: "strips".into() })
+    }
 
     fn open(folder: &Path) -> Result<SceneCatalog> {
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
@@ -189,12 +216,11 @@ mod tests {
     fn failed_write_leaves_the_catalog_unchanged() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
-        let provenance = SceneProvenance::Repository { source: "strips".into() };
-        scene_catalog.add("a", &provenance).expect("expected a written catalog");
+        scene_catalog.add("a", &strips()).expect("expected a written catalog");
         // A folder with the name of the temporary file makes every write fail.
         let obstacle = folder.path().join("scenes.new");
         fs::create_dir(&obstacle).expect("expected a new folder");
-        assert!(matches!(scene_catalog.add("b", &provenance), Err(Error::Fault { .. })));
+        assert!(matches!(scene_catalog.add("b", &strips()), Err(Error::Fault { .. })));
         assert!(matches!(scene_catalog.remove("a"), Err(Error::Fault { .. })));
         assert_eq!(scene_catalog.entries().into_keys().collect::<Vec<_>>(), ["a"]);
         fs::remove_dir(&obstacle).expect("expected to remove the folder");
@@ -205,8 +231,8 @@ mod tests {
     fn uploads_and_entries_without_each_other_are_removed() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
-        let (upload, tree) =
-            (SceneProvenance::Upload { entry: String::new() }, SceneProvenance::Repository { source: "tree".into() });
+        let upload = record(SceneProvenance::Upload { entry: String::new() });
+        let tree = record(SceneProvenance::Repository { source: "tree".into() });
         for name in ["complete", "lost"] {
             fs::create_dir(scene_catalog.upload_folder(name)).expect("expected a new folder");
             scene_catalog.add(name, &upload).expect("expected a written catalog");
@@ -234,16 +260,47 @@ mod tests {
     }
 
     #[test]
+    fn access_survives_a_restart_and_a_damaged_catalog() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
+        scene_catalog.add("a", &strips()).expect("expected a written catalog");
+        let access = SceneAccess { owner: "anna".into(), shared_with: ["ben".to_owned()].into() };
+        scene_catalog.set_access("a", access.clone()).expect("expected a written catalog");
+        drop(scene_catalog);
+        for is_damaged in [false, true] {
+            if is_damaged {
+                fs::write(folder.path().join("scenes.json"), "{").expect("expected a written file");
+            }
+            let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
+            assert_eq!(scene_catalog.find("a").map(|record| record.access), Some(access.clone()), "{is_damaged}");
+        }
+    }
+
+    #[test]
+    fn only_uploads_of_a_principal_are_found() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let scene_catalog = open(folder.path()).expect("expected an unlocked folder");
+        let upload = |owner: &str| SceneRecord {
+            provenance: SceneProvenance::Upload { entry: String::new() },
+            access: SceneAccess { owner: owner.into(), shared_with: ["*".to_owned()].into() },
+        };
+        for (name, record) in [("a", upload("anna")), ("b", upload("ben")), ("c", strips())] {
+            scene_catalog.add(name, &record).expect("expected a written catalog");
+        }
+        assert_eq!(scene_catalog.upload_folders_of("anna"), [scene_catalog.upload_folder("a")]);
+        assert!(scene_catalog.upload_folders_of("owner").is_empty());
+    }
+
+    #[test]
     fn catalog_persists_and_locks_its_folder() {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let first_catalog = open(folder.path()).expect("expected an unlocked folder");
-        let provenance = SceneProvenance::Repository { source: "strips".into() };
-        first_catalog.add("a", &provenance).expect("expected a written catalog");
-        first_catalog.add("b", &provenance).expect("expected a written catalog");
+        first_catalog.add("a", &strips()).expect("expected a written catalog");
+        first_catalog.add("b", &strips()).expect("expected a written catalog");
         assert_eq!(first_catalog.remove("b"), Ok(true));
         assert!(matches!(open(folder.path()), Err(Error::Unavailable { .. })));
         first_catalog.release();
         let second_catalog = open(folder.path()).expect("expected an unlocked folder");
-        assert_eq!(second_catalog.entries().into_iter().collect::<Vec<_>>(), [("a".to_owned(), provenance)]);
+        assert_eq!(second_catalog.entries().into_iter().collect::<Vec<_>>(), [("a".to_owned(), strips())]);
     }
 }

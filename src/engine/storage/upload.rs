@@ -48,9 +48,9 @@ pub struct Upload {
     /// Sum of the declared sizes of the files so far, in bytes.
     declared_bytes: u64,
     open_file: Option<OpenFile>,
-    /// The folder of all uploads.
-    uploads: PathBuf,
-    /// The files of other uploads. Read when the client first reuses a file.
+    /// The folders of uploads whose files the client may reuse.
+    reusable_folders: Vec<PathBuf>,
+    /// The files of `reusable_folders`. Read when the client first reuses a file.
     uploaded_files: Option<UploadedFiles>,
 }
 
@@ -111,7 +111,13 @@ struct OpenFile {
 }
 
 impl Upload {
-    /// Creates a temporary folder next to the finished uploads.
+    /// The name of the scene.
+    pub fn scene(&self) -> &str {
+        &self.header.scene
+    }
+
+    /// Creates a temporary folder next to the finished uploads. The client may reuse files of the uploads in
+    /// `reusable_folders`.
     ///
     /// # Errors
     /// `Invalid` for a malformed entry path, `Fault` of the disk.
@@ -120,6 +126,7 @@ impl Upload {
         file_system: &Arc<dyn FileSystem>,
         header: UploadHeader,
         permit: UploadPermit,
+        reusable_folders: Vec<PathBuf>,
     ) -> Result<Self> {
         if !header.entry.is_empty() {
             validate_path("header.entry", &header.entry)?;
@@ -131,7 +138,7 @@ impl Upload {
             hashes: BTreeMap::new(),
             declared_bytes: 0,
             open_file: None,
-            uploads: uploads.to_owned(),
+            reusable_folders,
             uploaded_files: None,
         })
     }
@@ -177,10 +184,10 @@ impl Upload {
         self.finish_file_if_complete()
     }
 
-    /// Adds a file whose content an uploaded scene has, by copying it. The arguments are those of [`Self::begin_file`].
+    /// Adds a file whose content a reusable upload has, by copying it. The arguments are those of [`Self::begin_file`].
     ///
     /// # Errors
-    /// `ContentNotFound` when no uploaded scene has the content, or its file has changed; otherwise as for
+    /// `ContentNotFound` when no reusable upload has the content, or its file has changed; otherwise as for
     /// [`Self::begin_file`].
     pub fn reuse_file(&mut self, path: &str, bytes: u64, sha256: &[u8]) -> Result<()> {
         let hash = parse_hash("file.sha256", sha256)?;
@@ -188,7 +195,7 @@ impl Upload {
             let field = "file.sha256".into();
             Error::ContentNotFound { field, what: "uploaded file", sha256: hex(&hash) }
         };
-        let files = self.uploaded_files.get_or_insert_with(|| find_uploaded_files(&self.uploads));
+        let files = self.uploaded_files.get_or_insert_with(|| find_uploaded_files(&self.reusable_folders));
         let mut source =
             files.get(&hash).into_iter().flatten().find_map(|path| File::open(path).ok()).ok_or_else(not_found)?;
         self.begin_file(path, bytes, sha256)?;
@@ -321,7 +328,7 @@ mod tests {
         let quota = UploadQuota::new(&Config::default(), BTreeMap::new());
         let permit = quota.admit(ClientId::Connection(1), total_bytes).expect("expected a free permit");
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
-        Upload::begin(folder, &disk, header, permit).expect("expected a temporary folder")
+        Upload::begin(folder, &disk, header, permit, vec![folder.join("known")]).expect("expected a temporary folder")
     }
 
     fn sha256_of(bytes: &[u8]) -> Vec<u8> {
@@ -348,8 +355,7 @@ mod tests {
         let mut upload = begin_upload(folder.path(), 1, 5);
         upload.begin_file("b.txt", 5, &sha256_of(b"hello")).expect("expected a new file");
         upload.write_chunk(b"hello").expect("expected an accepted chunk");
-        // The folder of a scene has the name of the scene.
-        let target = folder.path().join("s");
+        let target = folder.path().join("known");
         upload.finish().and_then(|upload| upload.commit(&target)).expect("expected a complete upload");
         let reuse = |bytes: u64, content: &[u8]| {
             let mut upload = begin_upload(folder.path(), 1, bytes);

@@ -108,15 +108,14 @@ fn hash_file(path: &Path) -> io::Result<ContentHash> {
     }
 }
 
-/// Finds the files of all uploads by their hashes. Leaves out damaged records and files that no longer exist. The hash of a
+/// Finds the files of uploads by their hashes. Leaves out damaged records and files that no longer exist. The hash of a
 /// file must be verified before it is reused.
-pub(in crate::engine) fn find_uploaded_files(uploads: &Path) -> UploadedFiles {
+pub(in crate::engine) fn find_uploaded_files(folders: &[PathBuf]) -> UploadedFiles {
     let mut found = UploadedFiles::new();
-    for upload in fs::read_dir(uploads).into_iter().flatten().flatten() {
-        // Unfinished uploads have no record.
-        let Some(record) = UploadRecord::read(&upload.path()) else { continue };
+    for folder in folders {
+        let Some(record) = UploadRecord::read(folder) else { continue };
         for (path, digits) in record.files {
-            let path = upload.path().join(path);
+            let path = folder.join(path);
             if let Some(hash) = parse_hex(&digits).filter(|_| path.is_file()) {
                 found.entry(hash).or_default().push(path);
             }
@@ -184,13 +183,15 @@ mod tests {
     #[test]
     fn uploaded_files_are_found_by_hash_while_they_exist() {
         let uploads = tempfile::tempdir().expect("expected a temporary folder");
-        assert!(find_uploaded_files(uploads.path()).is_empty());
-        let hash = write_upload(&uploads.path().join("a.b"));
-        fs::create_dir(uploads.path().join("without record")).expect("expected a new folder");
-        let path = uploads.path().join("a.b/x");
-        assert_eq!(find_uploaded_files(uploads.path()), [(hash, vec![path.clone()])].into());
+        let folders = ["a.b", "without record", "absent"].map(|name| uploads.path().join(name));
+        assert!(find_uploaded_files(&folders).is_empty());
+        let hash = write_upload(&folders[0]);
+        fs::create_dir(&folders[1]).expect("expected a new folder");
+        let path = folders[0].join("x");
+        assert_eq!(find_uploaded_files(&folders), [(hash, vec![path.clone()])].into());
+        assert!(find_uploaded_files(&folders[1..]).is_empty(), "expected only files of these folders");
         fs::remove_file(path).expect("expected a removed file");
-        assert!(find_uploaded_files(uploads.path()).is_empty());
+        assert!(find_uploaded_files(&folders).is_empty());
     }
 
     #[test]

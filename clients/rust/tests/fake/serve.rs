@@ -181,6 +181,15 @@ impl SceneService for FakeService {
         Ok(Response::new(v1::DeleteSceneResponse {}))
     }
 
+    async fn share_scene(
+        &self,
+        request: Request<v1::ShareSceneRequest>,
+    ) -> Result<Response<v1::ShareSceneResponse>, Status> {
+        let v1::ShareSceneRequest { scene, principals: shared_with } = request.into_inner();
+        self.check_scene(&scene)?;
+        Ok(Response::new(v1::ShareSceneResponse { owner: "owner".into(), shared_with }))
+    }
+
     type DescribeSceneStream = ResponseStream<v1::DescribeSceneResponse>;
 
     async fn describe_scene(

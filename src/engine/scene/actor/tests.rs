@@ -16,8 +16,10 @@ use crate::engine::output::step_output::{OutputBody, SharedPicture};
 use crate::engine::scene_memory::MemoryBudgets;
 use crate::engine::storage::file_system::{DiskFileSystem, FileSystem};
 use crate::engine::storage::provenance::SceneProvenance;
+use crate::engine::storage::scene_record::SceneAccess;
 use crate::engine::testing;
 use crate::hang_guard::HANG_GUARD;
+use crate::identity::Principal;
 use modalcast_model::scene::{BoundingBox, CameraSource, DirtyDomains, FrameSize, FrameStyle, RawStepUpdate};
 use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes};
 
@@ -47,6 +49,7 @@ impl TestScene {
         let params = OpenParams {
             name: "strips".into(),
             provenance: SceneProvenance::Repository { source: "strips".into() },
+            access: Arc::new(watch::Sender::new(SceneAccess::new(&Principal::owner()))),
             scene: testing::two_strips(),
             backends: Default::default(),
             id: 1,

@@ -1,0 +1,44 @@
+//! Who makes a call, and the log of the changes that callers make.
+
+use std::sync::Arc;
+
+use tonic::{Request, Status};
+
+use super::connection::ConnectionInfo;
+use super::status::{internal_fault, to_status};
+use crate::identity::{Credential, Principal};
+
+/// The credential with which a call was admitted, in the extensions of its request. `None` for a method that requires none.
+#[derive(Clone)]
+pub(super) struct CallCredential(pub(super) Option<Arc<Credential>>);
+
+/// Who makes a call.
+#[derive(Debug, Clone)]
+pub(super) struct Caller {
+    pub(super) principal: Arc<Principal>,
+    /// Address of the client, for the log.
+    pub(super) peer: String,
+}
+
+impl Caller {
+    /// # Errors
+    /// `INTERNAL` for a request that was not admitted with a credential.
+    pub(super) fn of<T>(request: &Request<T>) -> Result<Self, Status> {
+        let credential = request.extensions().get::<CallCredential>().and_then(|credential| credential.0.as_ref());
+        let principal = credential.ok_or_else(|| internal_fault("expected a call with a credential"))?.principal();
+        let peer = ConnectionInfo::of(request).map_err(to_status)?.peer().to_owned();
+        Ok(Self { principal: Arc::clone(principal), peer })
+    }
+
+    /// Logs a change of a scene, and whether it has succeeded.
+    pub(super) fn log_change<T>(&self, method: &str, scene: &str, result: Result<T, Status>) -> Result<T, Status> {
+        let (principal, peer) = (&self.principal.name, &self.peer);
+        match &result {
+            Ok(_) => tracing::info!(principal, peer, scene, method, "changed"),
+            Err(status) => {
+                tracing::info!(principal, peer, scene, method, code = ?status.code(), "not changed: {}", status.message());
+            }
+        }
+        result
+    }
+}
