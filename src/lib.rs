@@ -56,18 +56,19 @@
 //! | `modalcast-render::region` | rectangles of a frame that are drawn or cleared | |
 //! | `modalcast-render::types` | parameters and results of the renderer | `pass` |
 //! | `modalcast-render::pass` | names of the passes and stages, and their times | |
-//! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plants with one object per organ and their modes, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `beam_shape`, `backend_settings`, `scene`, `domain`, `memory`, `rounding`, `error` |
+//! | `modalcast-model::load` | scene loaders: OBJ, glTF, PLY, STL, Vega, NumPy, safetensors, SOFA, plants with one object per organ and their modes, `scene.toml`; the scene repository (a folder of scene sources) | `tree`, `beam_shape`, `backend_settings`, `scene`, `domain`, `memory`, `rounding`, `escaping`, `error` |
 //! | `modalcast-model::tree` | the built-in scene: a tree of beams, and the surface mesh that they deform | `beam_shape`, `scene`, `domain`, `error` |
 //! | `modalcast-model::beam_shape` | meshes that follow the sections of beams, and the inertia of beams | `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::shared_memory` | the traits of device memory that OpenGL and CUDA share, and of its copies to the host | `error` |
 //! | `modalcast-model::backend_settings` | settings of deformers and rasterizers, which are not part of a scene | `scene` |
-//! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `rounding`, `error` |
-//! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `memory`, `error` |
+//! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `rounding`, `escaping`, `error` |
+//! | `modalcast-model::domain` | mesh, modes U, material, texture; validated once, immutable | `memory`, `escaping`, `error` |
 //! | `modalcast-model::memory` | budgets of memory, which scenes reserve before they allocate | `error` |
 //! | `modalcast-model::fault_injection` | planned faults of devices, for tests of the recovery; empty without the feature `fault-injection` | `error` |
 //! | `modalcast-model::rounding` | numbers in messages | |
+//! | `modalcast-model::escaping` | texts of files and clients in messages | |
 //! | `modalcast-model::error` | the error type, with variants for errors of the caller, of the operator and of the server | |
 //! | `modalcast-beam::similarity` | rotated and scaled copies of beams | `beam`, `profile`, `inertia`, `station` |
 //! | `modalcast-beam::polyline` | beams along polylines with radii | `beam`, `station`, `profile`, `error` |

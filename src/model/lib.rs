@@ -9,6 +9,7 @@ mod beam_shape;
 pub mod deform;
 pub mod domain;
 pub mod error;
+pub mod escaping;
 pub mod fault_injection;
 pub mod load;
 pub mod memory;

@@ -9,6 +9,7 @@ use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
 use modalcast_model::error::{Error, fault};
+use modalcast_model::escaping::escape_controls;
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
 /// headers.
@@ -26,7 +27,9 @@ const RESTART_RETRY_DELAY: Duration = Duration::from_secs(5);
 /// `RetryInfo` while the renderer is opened again.
 const RENDERER_RETRY_DELAY: Duration = Duration::from_secs(1);
 
-fn truncate_text(text: String) -> String {
+/// The text as clients receive it: escaped, and of limited length.
+fn display_text(text: String) -> String {
+    let text = escape_controls(&text).into_owned();
     match text.char_indices().nth(MAX_TEXT_CHARS) {
         None => text,
         Some((end, _)) => format!("{}...", &text[..end]),
@@ -175,12 +178,11 @@ impl ErrorReport {
 
     fn into_status(self, message: String) -> Status {
         let texts = [("expected", self.expected), ("given", self.given)].into_iter().chain(self.metadata);
-        let metadata: HashMap<String, String> =
-            texts.map(|(key, text)| (key.to_owned(), truncate_text(text))).collect();
+        let metadata: HashMap<String, String> = texts.map(|(key, text)| (key.to_owned(), display_text(text))).collect();
         let mut details = ErrorDetails::with_error_info(self.reason.as_str_name(), ERROR_DOMAIN, metadata);
-        let message = truncate_text(message);
+        let message = display_text(message);
         if !self.field.is_empty() {
-            details.add_bad_request_violation(truncate_text(self.field), message.clone());
+            details.add_bad_request_violation(display_text(self.field), message.clone());
         }
         if let Some(delay) = self.retry_delay {
             details.set_retry_info(Some(delay));
@@ -199,9 +201,9 @@ pub(super) fn to_rejection(step: Option<u64>, error: &Error) -> Rejection {
     Rejection {
         step,
         reason: reason.into(),
-        field: truncate_text(place),
-        expected: truncate_text(expected),
-        given: truncate_text(given),
+        field: display_text(place),
+        expected: display_text(expected),
+        given: display_text(given),
     }
 }
 
@@ -256,6 +258,16 @@ mod tests {
         assert!(status.message().len() + status.details().len() < 4096);
         assert_eq!((rejection.step, rejection.reason()), (Some(7), Reason::InvalidField));
         assert_eq!((rejection.field.as_str(), &rejection.given), ("step.q", &error_info.metadata["given"]));
+    }
+
+    /// A client can put such characters into a name, and another one reads it in a terminal.
+    #[test]
+    fn controls_in_texts_of_clients_are_escaped() {
+        let error = modalcast_model::error::invalid("a\u{1b}[2J", "b", "c\u{202e}\n");
+        let rejection = to_rejection(None, &error);
+        let status = to_status(error);
+        assert_eq!(status.message(), r"a\u{1b}[2J: expected b, got c\u{202e}\n");
+        assert_eq!((rejection.field.as_str(), rejection.given.as_str()), (r"a\u{1b}[2J", r"c\u{202e}\n"));
     }
 
     #[test]

@@ -7,6 +7,7 @@ use image::{ImageDecoder as _, ImageFormat, ImageReader};
 
 use super::jpeg_memory::coefficient_bytes;
 use crate::error::{Result, invalid};
+use crate::escaping::escape_controls;
 use crate::memory::MemoryReservation;
 
 /// The largest width or height of a texture in pixels.
@@ -37,7 +38,7 @@ impl Texture {
     /// # Errors
     /// `Invalid` if a side is 0 or above 8192, or the number of bytes is not 4 x width x height.
     pub fn new(name: impl Into<String>, width: u32, height: u32, rgba: Vec<u8>) -> Result<Self> {
-        let name = name.into();
+        let name = escape_controls(&name.into()).into_owned();
         if width == 0 || height == 0 || width > MAX_TEXTURE_SIDE || height > MAX_TEXTURE_SIDE {
             let field = format!("texture '{name}': size");
             return Err(invalid(
@@ -65,7 +66,7 @@ impl Texture {
     /// # Errors
     /// `Invalid` if the bytes are no PNG, JPEG or WebP image, or a side exceeds 8192 pixels. `OutOfMemory`.
     pub fn decode(name: impl Into<String>, bytes: &[u8], memory: &Arc<MemoryReservation>) -> Result<Self> {
-        let name = name.into();
+        let name = escape_controls(&name.into()).into_owned();
         let decode_error =
             |error: &dyn std::fmt::Display| invalid(format!("texture '{name}'"), "a PNG, JPEG or WebP image", error);
         let mut reader = ImageReader::new(Cursor::new(bytes));

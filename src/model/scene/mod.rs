@@ -56,11 +56,13 @@ pub use step_update::{RawStepUpdate, StepUpdate};
 pub use transform_format::TransformFormat;
 pub use transform_roots::TransformRoots;
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use crate::domain::{AlphaMode, Domain, MAX_RING_TRIANGLES, Material, Shape, Texture};
 use crate::error::{Result, invalid};
+use crate::escaping::escape_controls;
 
 /// The smallest plausible value of the largest eigenvalue of a domain in (rad/s)^2: a period of 55 hours.
 const MIN_LARGEST_EIGENVALUE: f64 = 1e-9;
@@ -179,6 +181,7 @@ impl Scene {
             return Err(invalid("scene.origin", "finite numbers", format!("{:?}", parts.origin)));
         }
         parts.materials = parts.materials.into_iter().map(Material::validated).collect::<Result<_>>()?;
+        escape_names(&mut parts);
         check_names(&parts)?;
         check_textures(&parts)?;
         for index in 0..parts.domains.len() {
@@ -275,8 +278,8 @@ impl Scene {
     }
 }
 
-/// Limits number and length of the remarks, and removes control characters: remarks contain texts of files, which may be
-/// written to make trouble in a terminal or a log.
+/// Limits number and length of the remarks. Escapes control characters: remarks contain texts of files, which may be written
+/// to make trouble in a terminal or a log.
 fn limit_remarks(remarks: &mut Vec<String>) {
     let suppressed = remarks.len().saturating_sub(MAX_REMARKS);
     remarks.truncate(MAX_REMARKS);
@@ -284,10 +287,22 @@ fn limit_remarks(remarks: &mut Vec<String>) {
         if remark.chars().nth(MAX_REMARK_CHARACTERS).is_some() {
             *remark = remark.chars().take(MAX_REMARK_CHARACTERS).chain("...".chars()).collect();
         }
-        remark.retain(|character| !character.is_control());
+        escape_in_place(remark);
     }
     if suppressed > 0 {
         remarks.push(format!("and {suppressed} more remarks"));
+    }
+}
+
+/// Escapes control characters in the names of domains and materials. Textures have escaped names.
+fn escape_names(parts: &mut SceneParts) {
+    parts.domains.iter_mut().for_each(|domain| escape_in_place(&mut domain.name));
+    parts.materials.iter_mut().for_each(|material| escape_in_place(&mut material.name));
+}
+
+fn escape_in_place(text: &mut String) {
+    if let Cow::Owned(escaped) = escape_controls(text) {
+        *text = escaped;
     }
 }
 

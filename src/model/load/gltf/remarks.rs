@@ -1,6 +1,7 @@
 //! Remarks about features of a model that the loader does not support, without duplicates.
 
 use crate::error::Result;
+use crate::escaping::escape_controls;
 use crate::load::values::Corrections;
 
 /// The largest number of stored remarks, so that a malicious file cannot flood the log.
@@ -40,9 +41,9 @@ impl ImportRemarks {
     }
 }
 
-/// Sanitizes text from a file for display: no control characters, at most `max_characters` characters.
+/// Text from a file for display: escaped, at most `max_characters` characters.
 pub(super) fn sanitize(text: &str, max_characters: usize) -> String {
-    text.chars().filter(|character| !character.is_control()).take(max_characters).collect()
+    escape_controls(text).chars().take(max_characters).collect()
 }
 
 #[cfg(test)]
@@ -55,7 +56,7 @@ mod tests {
         (0..3).for_each(|_| remarks.add("same\u{1b}[31m".into()));
         (0..100).for_each(|index| remarks.add(format!("other {index}")));
         let list = remarks.into_list(true).expect("no corrections");
-        assert_eq!((list.len(), list[0].as_str()), (MAX_REMARKS + 1, "same[31m"));
+        assert_eq!((list.len(), list[0].as_str()), (MAX_REMARKS + 1, r"same\u{1b}[31m"));
         // 1 + 100 different remarks, of which 64 are stored.
         assert_eq!(list[MAX_REMARKS], "and 37 more remarks");
     }

@@ -5,6 +5,7 @@ use ply_rs_bw::ply::{ElementDef, Encoding, PropertyType};
 
 use super::element::{PlyElement, full_channel};
 use crate::error::{Error, Result, invalid};
+use crate::escaping::escape_controls;
 
 /// The longest part of a word or of a parser error in an error message, in characters.
 pub(super) const MAX_REASON_CHARACTERS: usize = 160;
@@ -91,8 +92,5 @@ fn incomplete(error: impl std::fmt::Display) -> Error {
 /// Text of a file or a parser for an error message.
 pub(super) fn quote(text: &[u8]) -> String {
     let text = String::from_utf8_lossy(text.trim_ascii());
-    text.chars()
-        .take(MAX_REASON_CHARACTERS)
-        .map(|character| if character.is_control() { ' ' } else { character })
-        .collect()
+    escape_controls(&text).chars().take(MAX_REASON_CHARACTERS).collect()
 }
