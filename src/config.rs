@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use bytes::Bytes;
-use modalcast_model::error::{Result, fault_in, invalid};
+use modalcast_model::error::{Result, invalid};
 use modalcast_model::load::LoadOptions;
 
 /// The deformation backend.
@@ -89,41 +89,19 @@ pub enum Authentication {
     Off,
 }
 
-/// The secret in the URL of the viewer. Its debug output does not show it.
-#[derive(Clone, PartialEq, Eq)]
-pub struct ViewerToken(String);
-
-impl ViewerToken {
-    /// A random token of 32 hexadecimal digits.
-    ///
-    /// # Errors
-    /// `Fault` when the system has no random numbers.
-    pub fn random() -> Result<Self> {
-        let mut bytes = [0; 16];
-        getrandom::fill(&mut bytes).map_err(fault_in("viewer token"))?;
-        Ok(Self(format!("{:032x}", u128::from_be_bytes(bytes))))
-    }
-
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
+/// Permissions of a Unix socket.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SocketPermissions {
+    /// Permission bits. Who can write to the socket can connect to it.
+    pub mode: u32,
+    /// The id of the socket's group. `None`: the group of the server's user.
+    pub group: Option<u32>,
 }
 
-impl std::str::FromStr for ViewerToken {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let is_valid = |letter: char| letter.is_ascii_alphanumeric() || letter == '-' || letter == '_';
-        match (16..=128).contains(&text.len()) && text.chars().all(is_valid) {
-            true => Ok(Self(text.into())),
-            false => Err("expected 16 to 128 letters, digits, '-' or '_'".into()),
-        }
-    }
-}
-
-impl std::fmt::Debug for ViewerToken {
-    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.write_str("ViewerToken(..)")
+impl Default for SocketPermissions {
+    /// Only the user of the server can connect.
+    fn default() -> Self {
+        Self { mode: 0o600, group: None }
     }
 }
 
@@ -146,6 +124,8 @@ pub struct Config {
     pub shared_memory: Option<PathBuf>,
     /// The folder of a Unix socket `PORT.sock` for each TCP port that the server listens on. `None`: no sockets.
     pub local_sockets: Option<PathBuf>,
+    /// Who may connect to the Unix sockets in `listen`.
+    pub socket_permissions: SocketPermissions,
     pub authentication: Authentication,
     /// The file that names the principals besides the owner; see `modalcast::identity`.
     pub principals: Option<PathBuf>,
@@ -153,8 +133,6 @@ pub struct Config {
     pub insecure: bool,
     /// Whether browsers are served: the viewer and the WebSocket.
     pub viewer: bool,
-    /// The secret in the URL of the viewer. `None` selects a random one.
-    pub viewer_token: Option<ViewerToken>,
     /// The recording that the viewer's page plays in place of the server's scenes.
     pub viewer_recording: Option<ViewerRecording>,
     /// The folder of scenes that clients may open. `None` allows only the built-in scenes.
@@ -261,11 +239,11 @@ impl Default for Config {
             listen: vec![ListenAddress::Tcp((Ipv4Addr::LOCALHOST, 50051).into())],
             shared_memory: None,
             local_sockets: None,
+            socket_permissions: SocketPermissions::default(),
             authentication: Authentication::default(),
             principals: None,
             insecure: false,
             viewer: true,
-            viewer_token: None,
             viewer_recording: None,
             scenes: None,
             load_options: LoadOptions::default(),
@@ -452,18 +430,6 @@ mod tests {
         for (field, config) in invalid_configs {
             let error = config.validated().expect_err(field).to_string();
             assert!(error.starts_with(field), "expected {field}, got {error}");
-        }
-    }
-
-    #[test]
-    fn viewer_token_is_long_and_secret() {
-        let token = ViewerToken::random().expect("expected random numbers");
-        assert_eq!(token.as_str().len(), 32);
-        assert_ne!(token, ViewerToken::random().expect("expected random numbers"));
-        assert_eq!(token.as_str().parse(), Ok(token.clone()));
-        assert!(!format!("{token:?}").contains(token.as_str()));
-        for text in ["", "0123456789abcde", "0123456789abcdef&", &"x".repeat(129)] {
-            assert!(text.parse::<ViewerToken>().is_err(), "{text}");
         }
     }
 

@@ -5781,6 +5781,20 @@ pub mod force_service_server {
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoRequest {}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CreateViewerLinkRequest {
+    /// The principal whose rights the session has; empty: that of the caller. Only a caller with the role `admin` may name
+    /// another one.
+    #[prost(string, tag = "1")]
+    pub principal: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CreateViewerLinkResponse {
+    /// The path and fragment of the link. A client prepends the scheme, host and port at which it reaches this server, and may
+    /// append "&scene=" and the name of a scene, or "#scene=" if the path has no fragment.
+    #[prost(string, tag = "1")]
+    pub url_path: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoResponse {
     /// Version of the program, for people.
     #[prost(string, tag = "1")]
@@ -5807,9 +5821,7 @@ pub struct GetServerInfoResponse {
     /// What this server can do, each feature once.
     #[prost(enumeration = "Feature", repeated, tag = "8")]
     pub features: ::prost::alloc::vec::Vec<i32>,
-    /// The path and query of the viewer's URL, "/?token=" and the token. A client prepends the host and port at which it
-    /// reaches this server. Empty if the viewer is off, and for callers without the role "admin", because the token
-    /// admits calls with that role.
+    /// The path of the viewer's page, "/"; empty if the viewer is off. The page needs a link of CreateViewerLink.
     #[prost(string, tag = "9")]
     pub viewer_url_path: ::prost::alloc::string::String,
 }
@@ -6052,6 +6064,34 @@ pub mod server_service_client {
                 .insert(GrpcMethod::new("modalcast.v1.ServerService", "GetServerInfo"));
             self.inner.unary(req, path, codec).await
         }
+        /// Makes a link to the viewer. It is valid once, for 24 hours at most: the page exchanges the code in it for a session
+        /// with the rights of the principal.
+        pub async fn create_viewer_link(
+            &mut self,
+            request: impl tonic::IntoRequest<super::CreateViewerLinkRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::CreateViewerLinkResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ServerService/CreateViewerLink",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(
+                    GrpcMethod::new("modalcast.v1.ServerService", "CreateViewerLink"),
+                );
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -6072,6 +6112,15 @@ pub mod server_service_server {
             request: tonic::Request<super::GetServerInfoRequest>,
         ) -> std::result::Result<
             tonic::Response<super::GetServerInfoResponse>,
+            tonic::Status,
+        >;
+        /// Makes a link to the viewer. It is valid once, for 24 hours at most: the page exchanges the code in it for a session
+        /// with the rights of the principal.
+        async fn create_viewer_link(
+            &self,
+            request: tonic::Request<super::CreateViewerLinkRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::CreateViewerLinkResponse>,
             tonic::Status,
         >;
     }
@@ -6182,6 +6231,52 @@ pub mod server_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = GetServerInfoSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.ServerService/CreateViewerLink" => {
+                    #[allow(non_camel_case_types)]
+                    struct CreateViewerLinkSvc<T: ServerService>(pub Arc<T>);
+                    impl<
+                        T: ServerService,
+                    > tonic::server::UnaryService<super::CreateViewerLinkRequest>
+                    for CreateViewerLinkSvc<T> {
+                        type Response = super::CreateViewerLinkResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::CreateViewerLinkRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ServerService>::create_viewer_link(&inner, request)
+                                    .await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = CreateViewerLinkSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -21,6 +21,7 @@ use std::io::Write as _;
 use clap::{Parser, Subcommand};
 
 use modalcast_model::error::Error;
+use modalcast_model::escaping::escape_controls;
 
 /// A GPU server for modal deformable objects: x = T (x0 + U q), rendered headless, streamed over gRPC.
 #[derive(Debug, Parser)]
@@ -55,6 +56,12 @@ enum Command {
     #[command(after_help = REPORT_EXAMPLES, disable_help_flag = true)]
     Report(sibling::Args),
     Token(token::Args),
+    /// Prints a link to the viewer of a running server, which is valid once.
+    #[command(after_help = LINK_EXAMPLES, disable_help_flag = true)]
+    Link(sibling::Args),
+    /// Shares a scene of a running server with other principals.
+    #[command(after_help = SHARE_EXAMPLES, disable_help_flag = true)]
+    Share(sibling::Args),
     Inspect(inspect::Args),
     Doctor(doctor::Args),
 }
@@ -82,6 +89,15 @@ const MODEL_EXAMPLES: &str = "Examples:
   modalcast model --help
   modalcast model part.stl --modes 20 --material steel --clamp 'z < 0.01' --out part.npz
   modalcast view part.npz";
+
+const LINK_EXAMPLES: &str = "Examples:
+  modalcast link
+  modalcast link anna
+  modalcast link --scene tree --server http://127.0.0.1:50051";
+
+const SHARE_EXAMPLES: &str = "Examples:
+  modalcast share tree anna ben
+  modalcast share tree '*'";
 
 const REPORT_EXAMPLES: &str = "Examples:
   modalcast report --help
@@ -146,6 +162,8 @@ pub fn run() -> u8 {
         Command::Report(args) => sibling::REPORT.execute(None, &args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Token(args) => token::run(&args),
+        Command::Link(args) => sibling::FETCH.execute(Some("link"), &args),
+        Command::Share(args) => sibling::FETCH.execute(Some("share"), &args),
         Command::Doctor(args) => doctor::run(&args),
     };
     finish(outcome)
@@ -159,11 +177,7 @@ pub fn finish(outcome: Outcome) -> u8 {
         Ok(Completion::ProgramFailed(code)) => code,
         Err(error) => {
             // Errors contain texts of files, which must not control the terminal.
-            let message = error.to_string();
-            eprintln!(
-                "modalcast: {}",
-                message.replace(|character: char| character.is_control() && character != '\n', " ")
-            );
+            eprintln!("modalcast: {}", escape_controls(&error.to_string()));
             exit_code(&error)
         }
     }

@@ -9,8 +9,8 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{Completion, Outcome, print_line};
 use crate::config::{
-    Authentication, BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, ValidatedConfig, ViewerToken,
-    default_local_sockets,
+    Authentication, BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, SocketPermissions,
+    ValidatedConfig, default_local_sockets,
 };
 use crate::engine::{Engine, EngineInfo};
 use crate::service::{self, Listener};
@@ -39,6 +39,13 @@ pub(super) struct Args {
     /// with the token in the file 'token' of the state folder.
     #[arg(long, env = "MODALCAST_PRINCIPALS", value_name = "FILE")]
     principals: Option<PathBuf>,
+    /// Permission bits in octal of the Unix sockets of --listen, for example 660. Who can write to a socket can connect to it,
+    /// and is then identified by the file of --principals.
+    #[arg(long, value_name = "MODE", default_value = "600", value_parser = parse_socket_mode)]
+    socket_mode: u32,
+    /// Group of the Unix sockets of --listen: a name or a number.
+    #[arg(long, value_name = "GROUP", value_parser = parse_group)]
+    socket_group: Option<u32>,
     /// Do not identify users by their account: programs of this user need the token, too. For accounts that several people
     /// share.
     #[arg(long)]
@@ -53,9 +60,6 @@ pub(super) struct Args {
     /// Do not serve browsers: neither the viewer nor the WebSocket.
     #[arg(long)]
     no_viewer: bool,
-    /// Secret in the URL of the viewer: 16 to 128 letters, digits, '-' or '_'. Default: random, new at each start.
-    #[arg(long, env = "MODALCAST_VIEWER_TOKEN", hide_env_values = true, value_name = "TOKEN")]
-    viewer_token: Option<ViewerToken>,
     /// Folder of scenes that clients may open. Files outside it are never read.
     #[arg(long, env = "MODALCAST_SCENES")]
     scenes: Option<PathBuf>,
@@ -177,11 +181,11 @@ impl Args {
             shared_memory: self.shared_memory.clone(),
             // Without authentication, clients need no other address than that of TCP.
             local_sockets: (!self.no_auth).then(default_local_sockets),
+            socket_permissions: SocketPermissions { mode: self.socket_mode, group: self.socket_group },
             authentication: self.authentication(),
             principals: self.principals.clone(),
             insecure: self.insecure,
             viewer: !self.no_viewer,
-            viewer_token: self.viewer_token.clone(),
             scenes: self.scenes.clone(),
             load_options: LoadOptions { is_strict: self.strict, ..LoadOptions::default() },
             state: self.state.clone().unwrap_or(defaults.state),
@@ -240,7 +244,7 @@ async fn serve(config: ValidatedConfig) -> Result<()> {
         started = start(config) => started?,
         () = signals.received() => return Ok(()),
     };
-    announce(&engine, &listener);
+    announce(&engine, &listener)?;
     service::serve(engine, listener, async move { signals.received().await }).await
 }
 
@@ -253,11 +257,29 @@ pub(super) async fn start(config: ValidatedConfig) -> Result<(Engine, Listener)>
     Ok((engine, listener))
 }
 
+fn parse_socket_mode(text: &str) -> Result<u32, String> {
+    let mode = u32::from_str_radix(text, 8).ok().filter(|mode| *mode <= 0o777);
+    mode.ok_or_else(|| "expected octal permission bits up to 777".into())
+}
+
+/// The id of a group, by its number or its name in `/etc/group`.
+fn parse_group(text: &str) -> Result<u32, String> {
+    let by_name = || {
+        let groups = std::fs::read_to_string("/etc/group").ok()?;
+        let id_of = |line: &str| line.strip_prefix(text)?.strip_prefix(':')?.split(':').nth(1)?.parse().ok();
+        groups.lines().find_map(id_of)
+    };
+    text.parse().ok().or_else(by_name).ok_or_else(|| "expected a number, or the name of a group in /etc/group".into())
+}
+
 /// Logs the devices and prints the addresses.
-pub(super) fn announce(engine: &Engine, listener: &Listener) {
+///
+/// # Errors
+/// As for [`print_addresses`].
+pub(super) fn announce(engine: &Engine, listener: &Listener) -> Result<()> {
     log_devices(engine.info());
     log_authentication(engine.config());
-    print_addresses(listener);
+    print_addresses(listener)
 }
 
 /// Logs how clients are admitted.
@@ -272,20 +294,24 @@ fn log_authentication(config: &Config) {
     }
 }
 
-/// Prints the addresses. Warns about those that other machines can connect to.
-pub(super) fn print_addresses(listener: &Listener) {
+/// Prints the addresses, and links to the viewer. Warns about addresses that other machines can connect to.
+///
+/// # Errors
+/// `Fault` when the system has no random numbers.
+pub(super) fn print_addresses(listener: &Listener) -> Result<()> {
     for address in listener.remote_addresses() {
         tracing::warn!("{address} accepts clients on other machines, and encrypts nothing");
     }
     for url in listener.urls() {
         print_line(format!("listening on {url}"));
     }
-    for url in listener.viewer_urls() {
-        print_line(format!("viewer at {url}"));
+    for link in listener.viewer_links()? {
+        print_line(format!("viewer at {link}"));
     }
     for command in tunnel_commands(listener) {
         print_line(format!("viewer from another machine: run '{command}' there, then open this URL"));
     }
+    Ok(())
 }
 
 /// The commands that make the viewer available on another machine through SSH. There are none unless the user has
@@ -339,6 +365,18 @@ impl TerminationSignals {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn socket_mode_is_octal_and_groups_have_names_or_numbers() {
+        assert_eq!(parse_socket_mode("660"), Ok(0o660));
+        for text in ["", "8", "1777", "-1", "rw"] {
+            assert!(parse_socket_mode(text).is_err(), "{text}");
+        }
+        assert_eq!((parse_group("root"), parse_group("65534")), (Ok(0), Ok(65534)));
+        for text in ["", "no such group", "-1", "root:x"] {
+            assert!(parse_group(text).is_err(), "{text}");
+        }
+    }
 
     #[test]
     fn tunnel_leads_to_the_address_of_the_ssh_connection() {

@@ -24,16 +24,25 @@ pub(super) struct Sibling {
     program: &'static str,
     /// The package that contains it.
     package: &'static str,
+    /// Whether the program must be of the same build. Clients of the server need only the same protocol.
+    needs_same_build: bool,
 }
 
 /// Benchmarks.
-pub(super) const REPORT: Sibling = Sibling { program: "modalcast-report", package: "modalcast-bench" };
+pub(super) const REPORT: Sibling =
+    Sibling { program: "modalcast-report", package: "modalcast-bench", needs_same_build: true };
 
 /// Recordings: a client of the server.
-pub(super) const RECORD: Sibling = Sibling { program: "modalcast-record", package: "modalcast-recording" };
+pub(super) const RECORD: Sibling =
+    Sibling { program: "modalcast-record", package: "modalcast-recording", needs_same_build: true };
+
+/// Short calls: a client of the server.
+pub(super) const FETCH: Sibling =
+    Sibling { program: "modalcast-fetch", package: "modalcast-client", needs_same_build: false };
 
 /// Modes of surfaces.
-pub(super) const MODES: Sibling = Sibling { program: "modalcast-modes", package: "modalcast-modes" };
+pub(super) const MODES: Sibling =
+    Sibling { program: "modalcast-modes", package: "modalcast-modes", needs_same_build: true };
 
 impl Sibling {
     /// File name of the executable.
@@ -55,7 +64,9 @@ impl Sibling {
     pub(super) fn checked_path(&self) -> Result<PathBuf> {
         let own_path = std::env::current_exe().map_err(fault_in("program"))?;
         let program_path = own_path.with_file_name(self.program);
-        self.check_build(&program_path)?;
+        if self.needs_same_build {
+            self.check_build(&program_path)?;
+        }
         Ok(program_path)
     }
 

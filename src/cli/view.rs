@@ -1,6 +1,9 @@
 //! `modalcast view`: runs a server with one scene, or with a recording, and opens its viewer in the browser.
 
+use std::fs::OpenOptions;
+use std::io::Write as _;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
@@ -137,11 +140,14 @@ impl Args {
         .validated()
     }
 
-    /// Prints the URL, and opens it in the browser unless the user works on another machine.
-    fn show(&self, url: &str) {
-        print_line(format!("open {url}"));
-        if !self.no_open && std::env::var_os("SSH_CONNECTION").is_none() {
-            open_browser(url);
+    /// Prints the link, and opens it in the browser unless the user works on another machine.
+    fn show(&self, link: &str, state: &Path) {
+        print_line(format!("open {link}"));
+        if !self.no_open
+            && std::env::var_os("SSH_CONNECTION").is_none()
+            && let Err(error) = open_browser(link, state)
+        {
+            tracing::info!(%error, "no browser was opened");
         }
     }
 
@@ -203,10 +209,9 @@ async fn view(
         opened = open => opened?,
         () = signals.received() => return Ok(Completion::Success),
     };
-    announce(&engine, &listener);
+    announce(&engine, &listener)?;
     // The sockets are already open, so the browser and the physics process wait until the server answers.
-    // Names of scenes have only letters that are valid in a URL.
-    args.show(&format!("{}#scene={scene}", viewer_url(&listener)?));
+    args.show(&scene_link(&viewer_link(&listener)?, &scene), &engine.config().state);
     let start = |path: PathBuf| start_physics(&path, args.slow, &force_files, &listener, &scene);
     let physics = physics_program.map(start).transpose()?;
     let (stop_sender, stopped) = oneshot::channel();
@@ -226,15 +231,22 @@ async fn view(
 async fn play(args: &Args, config: ValidatedConfig) -> Outcome {
     let mut signals = TerminationSignals::install()?;
     let (engine, listener) = start(config).await?;
-    print_addresses(&listener);
-    args.show(&viewer_url(&listener)?);
+    print_addresses(&listener)?;
+    args.show(&viewer_link(&listener)?, &engine.config().state);
     service::serve(engine, listener, async move { signals.received().await }).await?;
     Ok(Completion::Success)
 }
 
-/// The URL of the viewer.
-fn viewer_url(listener: &Listener) -> Result<String> {
-    listener.viewer_urls().into_iter().next().ok_or_else(|| fault("view", "expected the URL of the viewer"))
+/// A link to a scene.
+fn scene_link(link: &str, scene: &str) -> String {
+    // Names of scenes have only letters that are valid in a URL.
+    let separator = if link.contains('#') { '&' } else { '#' };
+    format!("{link}{separator}scene={scene}")
+}
+
+/// A link to the viewer.
+fn viewer_link(listener: &Listener) -> Result<String> {
+    listener.viewer_links()?.into_iter().next().ok_or_else(|| fault("view", "expected a link to the viewer"))
 }
 
 fn start_physics(
@@ -257,13 +269,17 @@ fn parse_factor(text: &str) -> std::result::Result<f64, String> {
     factor.ok_or_else(|| "expected a positive number up to 1000000".into())
 }
 
-/// Opens a URL in the browser. A machine without a browser is not an error, because the URL is printed.
-fn open_browser(url: &str) {
-    let opener =
-        Command::new(URL_OPENER).arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
-    match opener {
-        // Waits for the end of the program, so that it does not remain as a zombie.
-        Ok(mut opener) => drop(std::thread::spawn(move || opener.wait())),
-        Err(error) => tracing::info!(%error, "no browser was opened"),
-    }
+/// Opens a link in the browser. Other users can read the arguments of a process, so the browser gets a file of this user
+/// that leads to the link. Some browsers may not read it; the link is printed, too.
+fn open_browser(link: &str, state: &Path) -> std::io::Result<()> {
+    let path = state.join("viewer.html");
+    std::fs::remove_file(&path).ok(); // Of an earlier start.
+    let mut file = OpenOptions::new().write(true).create_new(true).mode(0o600).open(&path)?;
+    // A link has only letters that are valid in a URL, and no quotation marks.
+    write!(file, "<!doctype html><title>modalcast</title><script>location.replace(\"{link}\")</script>")?;
+    let mut opener =
+        Command::new(URL_OPENER).arg(path).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn()?;
+    // Waits for the end of the program, so that it does not remain as a zombie.
+    std::thread::spawn(move || opener.wait());
+    Ok(())
 }

@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
-use super::principal::{Credential, Principal};
+use super::principal::{Credential, OWNER, Principal};
 use super::principals_file::Credentials;
 use super::token::{TokenHash, read_or_create_token};
+use super::viewer_sessions::ViewerSessions;
 use modalcast_model::error::Result;
 
 /// How often the file of principals is compared with the last one, and tokens are checked for their end.
@@ -22,6 +23,7 @@ pub struct Directory {
     own_token: TokenHash,
     file: Option<PathBuf>,
     state: Mutex<DirectoryState>,
+    viewer_sessions: ViewerSessions,
 }
 
 #[derive(Debug)]
@@ -64,6 +66,7 @@ impl Directory {
             own_token: read_or_create_token(token_file)?,
             file: principals.map(Path::to_owned),
             state: Mutex::new(DirectoryState { credentials, version }),
+            viewer_sessions: ViewerSessions::default(),
         })
     }
 
@@ -87,6 +90,18 @@ impl Directory {
         }
         let credential = self.lock().credentials.by_token.get(&hash).cloned()?;
         (!credential.has_expired(SystemTime::now())).then_some(credential)
+    }
+
+    /// The credential for viewer sessions of the principal with this name.
+    pub fn find_name(&self, name: &str) -> Option<Arc<Credential>> {
+        if name == OWNER {
+            return Some(Arc::clone(&self.owner));
+        }
+        self.lock().credentials.by_name.get(name).cloned()
+    }
+
+    pub const fn viewer_sessions(&self) -> &ViewerSessions {
+        &self.viewer_sessions
     }
 
     /// Keeps the credentials up to date until this future is dropped.

@@ -9,9 +9,11 @@ mod principal;
 mod principals_file;
 mod role;
 mod token;
+mod viewer_sessions;
 
 pub use directory::Directory;
 pub use principal::{Credential, OWNER, Principal};
 pub use principals_file::check_principal_name;
 pub use role::Role;
 pub use token::{TokenHash, new_token};
+pub use viewer_sessions::ViewerSessions;

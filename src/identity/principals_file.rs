@@ -49,6 +49,8 @@ const OTHERS_WRITE: u32 = 0o022;
 pub(super) struct Credentials {
     pub(super) by_uid: BTreeMap<u32, Arc<Credential>>,
     pub(super) by_token: BTreeMap<TokenHash, Arc<Credential>>,
+    /// For the viewer sessions that an administrator gives to principals, by their names.
+    pub(super) by_name: BTreeMap<String, Arc<Credential>>,
 }
 
 #[derive(Debug, Deserialize)]
@@ -127,6 +129,7 @@ impl Credentials {
     /// Adds the credentials of one principal.
     fn add(&mut self, entry: PrincipalEntry, own_uid: u32) -> Result<()> {
         let principal = Arc::new(Principal { name: entry.name, role: entry.role });
+        self.by_name.insert(principal.name.clone(), Credential::new(Arc::clone(&principal), None));
         for (field, count) in [("uids", entry.uids.len()), ("token", entry.token.len())] {
             if count > MAX_CREDENTIALS {
                 return Err(invalid(field, format!("at most {MAX_CREDENTIALS} entries"), count));
@@ -161,7 +164,7 @@ impl Credentials {
 
     /// All credentials.
     pub(super) fn all(&self) -> impl Iterator<Item = &Arc<Credential>> {
-        self.by_uid.values().chain(self.by_token.values())
+        self.by_uid.values().chain(self.by_token.values()).chain(self.by_name.values())
     }
 
     /// Replaces the credentials that have an equal one in `former` by it, so that these calls continue, and revokes the
@@ -169,6 +172,7 @@ impl Credentials {
     pub(super) fn take_over(&mut self, former: &Self) {
         take_over_equal(&mut self.by_uid, &former.by_uid);
         take_over_equal(&mut self.by_token, &former.by_token);
+        take_over_equal(&mut self.by_name, &former.by_name);
     }
 }
 
@@ -225,7 +229,8 @@ mod tests {
         let end = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(1_798_761_600);
         assert!(dashboard.has_expired(end));
         assert!(!dashboard.has_expired(end - std::time::Duration::from_secs(1)));
-        assert_eq!(credentials.all().count(), 3);
+        // Each principal has one for viewer sessions, too.
+        assert_eq!(credentials.all().count(), 3 + 2);
     }
 
     #[test]

@@ -6,6 +6,8 @@ use serde::Deserialize;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Role {
+    /// Grants nothing: a connection that carries the calls of others, each with its own token.
+    Proxy,
     /// Lists scenes and receives pictures.
     Pixels,
     /// Receives geometry: descriptions, vertices, states and picked points.
@@ -21,11 +23,13 @@ pub enum Role {
 }
 
 impl Role {
-    pub const ALL: [Self; 6] = [Self::Pixels, Self::View, Self::Interact, Self::Drive, Self::Upload, Self::Admin];
+    pub const ALL: [Self; 7] =
+        [Self::Proxy, Self::Pixels, Self::View, Self::Interact, Self::Drive, Self::Upload, Self::Admin];
 
     /// The name in the file of principals.
     pub const fn name(self) -> &'static str {
         match self {
+            Self::Proxy => "proxy",
             Self::Pixels => "pixels",
             Self::View => "view",
             Self::Interact => "interact",

@@ -101,9 +101,9 @@ impl ConnectionServer {
                 self.serve_http2(socket, &info_with(credential), slot).await;
             }
             (Protocol::Other(first_bytes), Some(web)) => {
-                // The token in the URL of the viewer is a credential of the owner.
-                let credential = Arc::clone(self.authenticator.directory().owner());
-                web.serve(socket, first_bytes, info_with(Some(credential)), slot).await;
+                // Browsers send the token of their session in a message.
+                let credential = self.authenticator.credential_of_connection(peer.uid);
+                web.serve(socket, first_bytes, info_with(credential), slot).await;
             }
             (Protocol::Other(_), None) => {}
         }

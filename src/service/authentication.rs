@@ -16,7 +16,7 @@ use modalcast_model::error::{Error, Result};
 
 /// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
 /// delayed, so wrong ones do not lock out other clients.
-const WRONG_TOKEN_DELAY: Duration = Duration::from_millis(500);
+pub(super) const WRONG_TOKEN_DELAY: Duration = Duration::from_millis(500);
 
 /// Shortest time between two log records of rejected calls.
 const LOG_INTERVAL: Duration = Duration::from_secs(1);
@@ -65,6 +65,22 @@ impl Authenticator {
             Authentication::UsersAndTokens => self.directory.find_uid(uid?),
             Authentication::Tokens => None,
         }
+    }
+
+    /// The path of a new link to the viewer, whose session has the rights of a credential. A server without authentication
+    /// needs no code.
+    ///
+    /// # Errors
+    /// `Fault` when the system has no random numbers.
+    pub(super) fn viewer_url_path(&self, credential: &Arc<Credential>) -> Result<String> {
+        match self.authentication {
+            Authentication::Off => Ok("/".into()),
+            _ => Ok(format!("/#code={}", self.directory.viewer_sessions().new_code(credential)?)),
+        }
+    }
+
+    pub(super) fn authentication(&self) -> Authentication {
+        self.authentication
     }
 
     /// Admits a call. Its bearer token outranks the credential of its connection. Returns the credential of the caller, or
@@ -128,7 +144,7 @@ impl Authenticator {
 }
 
 /// The bearer token of a call (RFC 6750, 2.1). `None` for another header, and for more than one.
-fn bearer_token(headers: &HeaderMap) -> Option<&str> {
+pub(super) fn bearer_token(headers: &HeaderMap) -> Option<&str> {
     let mut values = headers.get_all(header::AUTHORIZATION).iter();
     let (scheme, token) = values.next()?.to_str().ok()?.split_once(' ')?;
     (scheme.eq_ignore_ascii_case("bearer") && values.next().is_none()).then_some(token.trim())

@@ -16,6 +16,7 @@ pub(super) struct CallCredential(pub(super) Option<Arc<Credential>>);
 #[derive(Debug, Clone)]
 pub(super) struct Caller {
     pub(super) principal: Arc<Principal>,
+    pub(super) credential: Arc<Credential>,
     /// Address of the client, for the log.
     pub(super) peer: String,
 }
@@ -25,9 +26,9 @@ impl Caller {
     /// `INTERNAL` for a request that was not admitted with a credential.
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, Status> {
         let credential = request.extensions().get::<CallCredential>().and_then(|credential| credential.0.as_ref());
-        let principal = credential.ok_or_else(|| internal_fault("expected a call with a credential"))?.principal();
+        let credential = Arc::clone(credential.ok_or_else(|| internal_fault("expected a call with a credential"))?);
         let peer = ConnectionInfo::of(request).map_err(to_status)?.peer().to_owned();
-        Ok(Self { principal: Arc::clone(principal), peer })
+        Ok(Self { principal: Arc::clone(credential.principal()), credential, peer })
     }
 
     /// Logs a change of a scene, and whether it has succeeded.

@@ -1,31 +1,32 @@
 //! `ServerService`: version, features, devices and limits of the server.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
+use super::authentication::Authenticator;
 use super::caller::Caller;
 use super::connection::MAX_DRIVES;
+use super::status::to_status;
 use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
-use crate::identity::Role;
+use crate::identity::{Credential, Principal, Role};
+use modalcast_model::error::{Error, invalid};
 
 /// Implementation of `ServerService`.
 pub(super) struct ServerServiceImpl {
     pub(super) engine: Engine,
-    /// Empty if the viewer is off.
-    pub(super) viewer_url_path: String,
+    pub(super) authenticator: Arc<Authenticator>,
 }
 
 #[tonic::async_trait]
 impl v1::server_service_server::ServerService for ServerServiceImpl {
     async fn get_server_info(
         &self,
-        request: Request<v1::GetServerInfoRequest>,
+        _: Request<v1::GetServerInfoRequest>,
     ) -> Result<Response<v1::GetServerInfoResponse>, Status> {
-        // The token in the URL of the viewer admits calls of the owner.
-        let is_admin = Caller::of(&request)?.principal.role == Role::Admin;
         let info = self.engine.info();
         let config = self.engine.config();
         let (renderer, is_software) = match &info.renderer {
@@ -59,8 +60,40 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             limits: Some(limits),
             protocol_version: v1::PROTOCOL_VERSION,
             features: list_features(info, config).into_iter().map(Into::into).collect(),
-            viewer_url_path: if is_admin { self.viewer_url_path.clone() } else { String::new() },
+            viewer_url_path: if config.viewer { "/".into() } else { String::new() },
         }))
+    }
+
+    async fn create_viewer_link(
+        &self,
+        request: Request<v1::CreateViewerLinkRequest>,
+    ) -> Result<Response<v1::CreateViewerLinkResponse>, Status> {
+        let Caller { principal, credential, .. } = Caller::of(&request)?;
+        let v1::CreateViewerLinkRequest { principal: name } = request.into_inner();
+        if !self.engine.config().viewer {
+            let remedy = "Start it without --no-viewer".into();
+            let reason = "the server has no viewer".into();
+            return Err(to_status(Error::Unavailable { what: "viewer", reason, remedy }));
+        }
+        let credential = match name.is_empty() || name == principal.name {
+            true => credential,
+            false => self.find_principal(&name, &principal).map_err(to_status)?,
+        };
+        let url_path = self.authenticator.viewer_url_path(&credential).map_err(to_status)?;
+        Ok(Response::new(v1::CreateViewerLinkResponse { url_path }))
+    }
+}
+
+impl ServerServiceImpl {
+    /// The credential for sessions of another principal, which only an administrator may give.
+    fn find_principal(&self, name: &str, caller: &Principal) -> Result<Arc<Credential>, Error> {
+        if caller.role != Role::Admin {
+            let given = format!("'{}' with the role '{}'", caller.name, caller.role.name());
+            let expected = "the role 'admin' for a link of another principal".into();
+            return Err(Error::NotPermitted { expected, given });
+        }
+        let unknown = || invalid("principal", "a principal of this server", format!("'{}'", name.escape_debug()));
+        self.authenticator.directory().find_name(name).ok_or_else(unknown)
     }
 }
 

@@ -13,7 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
 use super::authentication::Authenticator;
-use crate::config::{Config, ListenAddress, ViewerToken};
+use crate::config::{Config, ListenAddress, SocketPermissions};
 use modalcast_model::error::{Error, Result};
 
 /// Bound sockets, and the credentials of their clients. Dropping it removes the files of the Unix sockets.
@@ -27,8 +27,7 @@ pub struct Listener {
     urls: Vec<String>,
     /// The addresses of TCP sockets.
     addresses: Vec<SocketAddr>,
-    /// `None` if the viewer is off.
-    pub(super) viewer_token: Option<ViewerToken>,
+    has_viewer: bool,
     pub(super) authenticator: Arc<Authenticator>,
 }
 
@@ -71,15 +70,11 @@ impl Listener {
             files: Vec::new(),
             urls: Vec::new(),
             addresses: Vec::new(),
-            viewer_token: None,
+            has_viewer: config.viewer,
             authenticator: Authenticator::new(config)?,
         };
-        if config.viewer {
-            let token = config.viewer_token.clone();
-            listener.viewer_token = Some(token.map_or_else(ViewerToken::random, Ok)?);
-        }
         for address in &config.listen {
-            listener.add(address).await.map_err(|error| Error::Unavailable {
+            listener.add(address, config.socket_permissions).await.map_err(|error| Error::Unavailable {
                 what: "listening address",
                 reason: format!("{address}: {error}"),
                 remedy: "Set another address with --listen".into(),
@@ -106,7 +101,7 @@ impl Listener {
             let path = folder.join(format!("{port}.sock"));
             let bind = || {
                 create_private_folder(folder)?;
-                SocketFile::bind(&path)
+                SocketFile::bind(&path, SocketPermissions::default())
             };
             match bind() {
                 Ok((socket, file)) => {
@@ -120,13 +115,13 @@ impl Listener {
     }
 
     fn add_shared_memory(&mut self, path: &Path) -> io::Result<()> {
-        let (socket, file) = SocketFile::bind(path)?;
+        let (socket, file) = SocketFile::bind(path, SocketPermissions::default())?;
         self.shared_memory = Some(socket);
         self.files.push(file);
         Ok(())
     }
 
-    async fn add(&mut self, address: &ListenAddress) -> io::Result<()> {
+    async fn add(&mut self, address: &ListenAddress, permissions: SocketPermissions) -> io::Result<()> {
         let socket = match address {
             ListenAddress::Tcp(address) => {
                 let socket = TcpListener::bind(address).await?;
@@ -136,7 +131,7 @@ impl Listener {
                 ListeningSocket::Tcp(socket)
             }
             ListenAddress::Unix(path) => {
-                let (socket, file) = SocketFile::bind(path)?;
+                let (socket, file) = SocketFile::bind(path, permissions)?;
                 self.urls.push(address.to_string());
                 self.files.push(file);
                 ListeningSocket::Unix(socket)
@@ -156,10 +151,15 @@ impl Listener {
         self.addresses.iter().copied().filter(|address| !address.ip().is_loopback())
     }
 
-    /// The URLs of the viewer for browsers on this machine, in the order of the addresses. Empty if the viewer is off.
-    pub fn viewer_urls(&self) -> Vec<String> {
-        let Some(path) = self.viewer_url_path() else { return Vec::new() };
-        self.local_urls().into_iter().map(|url| url + &path).collect()
+    /// New links to the viewer for the user of the server, in the order of the addresses. Each is valid once, in a browser
+    /// on this machine. Empty if the viewer is off.
+    ///
+    /// # Errors
+    /// `Fault` when the system has no random numbers.
+    pub fn viewer_links(&self) -> Result<Vec<String>> {
+        let addresses = self.viewer_addresses();
+        let owner = self.authenticator.directory().owner();
+        addresses.map(|address| Ok(format!("http://{address}{}", self.authenticator.viewer_url_path(owner)?))).collect()
     }
 
     /// The URLs at which programs on this machine reach the TCP sockets, in the order of the addresses.
@@ -169,12 +169,7 @@ impl Listener {
 
     /// The addresses in the viewer's URLs.
     pub fn viewer_addresses(&self) -> impl Iterator<Item = SocketAddr> {
-        self.addresses.iter().filter(|_| self.viewer_token.is_some()).map(|address| local_address(*address))
-    }
-
-    /// The path and query of the URLs of the viewer. `None` if the viewer is off.
-    pub(super) fn viewer_url_path(&self) -> Option<String> {
-        self.viewer_token.as_ref().map(|token| format!("/?token={}", token.as_str()))
+        self.addresses.iter().filter(|_| self.has_viewer).map(|address| local_address(*address))
     }
 }
 
@@ -250,14 +245,19 @@ pub(super) struct SocketFile {
 }
 
 impl SocketFile {
-    /// Binds a socket that only the user of this process can connect to.
-    fn bind(path: &Path) -> io::Result<(UnixListener, Self)> {
+    /// Binds a socket. Until it has its permissions, only the user of this process can connect.
+    fn bind(path: &Path, permissions: SocketPermissions) -> io::Result<(UnixListener, Self)> {
         check_replaceable(path)?;
         // The socket gets its permissions before its name, and the rename replaces a stale file.
         let temporary_path = path.with_extension(format!("{}.new", std::process::id()));
         let bind = || {
             let listener = UnixListener::bind(&temporary_path)?;
-            std::fs::set_permissions(&temporary_path, std::fs::Permissions::from_mode(0o600))?;
+            let set_mode = |mode| std::fs::set_permissions(&temporary_path, std::fs::Permissions::from_mode(mode));
+            set_mode(0o600)?;
+            if let Some(group) = permissions.group {
+                std::os::unix::fs::chown(&temporary_path, None, Some(group))?;
+            }
+            set_mode(permissions.mode)?;
             let metadata = std::fs::metadata(&temporary_path)?;
             std::fs::rename(&temporary_path, path)?;
             Ok((listener, Self { path: path.to_owned(), identity: (metadata.dev(), metadata.ino()) }))

@@ -84,13 +84,12 @@ pub async fn serve(
     let health = Health { reporter: health_reporter, is_serving: Arc::default() };
     health.set(true).await;
     let shared_memory = SharedMemory::default();
-    let viewer_url_path = listener.viewer_url_path().unwrap_or_default();
     let authenticator = Arc::clone(&listener.authenticator);
-    let routes = routes(&engine, &config, &shared_memory, &authenticator, viewer_url_path)?.with(health_server);
+    let routes = routes(&engine, &config, &shared_memory, &authenticator)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
-    let web = listener.viewer_token.clone().map(|token| {
-        let access = Access::new(token, host_name().filter(|_| accepts_machines));
-        WebServer::new(routes.clone(), access, Arc::clone(&health.is_serving), &config)
+    let web = config.viewer.then(|| {
+        let access = Access::new(host_name().filter(|_| accepts_machines));
+        WebServer::new(routes.clone(), access, &authenticator, Arc::clone(&health.is_serving), &config)
     });
     let connection_server = ConnectionServer::new(routes, web.transpose()?, Arc::clone(&authenticator), &config);
     // The files are removed when this function returns.
@@ -201,7 +200,6 @@ fn routes(
     config: &Config,
     shared_memory: &SharedMemory,
     authenticator: &Arc<Authenticator>,
-    viewer_url_path: String,
 ) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
@@ -229,7 +227,7 @@ fn routes(
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
             engine: engine.clone(),
-            viewer_url_path
+            authenticator: Arc::clone(authenticator),
         })))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
         .with(with_limits!(StepServiceServer::new(step_service)))

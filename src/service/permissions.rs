@@ -12,7 +12,7 @@ pub(super) enum Requirement {
 }
 
 /// Every method of every service. A method that is not listed is denied.
-const METHODS: [(&str, Requirement); 27] = {
+const METHODS: [(&str, Requirement); 28] = {
     use Requirement::{Public, Role as Requires};
     use Role::{Drive, Interact, Pixels, Upload, View};
     [
@@ -21,6 +21,7 @@ const METHODS: [(&str, Requirement); 27] = {
         ("grpc.reflection.v1.ServerReflection/ServerReflectionInfo", Requires(Pixels)),
         ("grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo", Requires(Pixels)),
         ("modalcast.v1.ServerService/GetServerInfo", Requires(Pixels)),
+        ("modalcast.v1.ServerService/CreateViewerLink", Requires(Pixels)),
         ("modalcast.v1.SceneService/ListScenes", Requires(Pixels)),
         ("modalcast.v1.FrameService/RenderFrame", Requires(Pixels)),
         ("modalcast.v1.FrameService/StreamFrames", Requires(Pixels)),

@@ -214,23 +214,34 @@ fn view_ends_as_the_computation_and_keeps_nothing() {
 }
 
 #[test]
-fn view_serves_a_page_that_contains_the_recording() {
+fn view_serves_a_recording_to_the_session_of_its_link() {
+    const RECORDING: &str = "\u{89}MCAP0\r\n";
     let folder = tempfile::tempdir().expect("expected a temporary folder");
     std::fs::write(folder.path().join("a.mcap"), b"\x89MCAP0\r\n").expect("expected a written file");
     let mut server =
         command(folder.path(), &["view", "a.mcap", "--no-open"]).stdout(Stdio::piped()).spawn().expect("a process");
     let lines = BufReader::new(server.stdout.take().expect("expected an output")).lines();
-    let url = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("open http://").map(str::to_owned));
-    let url = url.expect("expected the URL of the page");
-    let (host, path) = url.split_once('/').expect("expected a path");
-    let mut socket = TcpStream::connect(host).expect("expected a connection");
-    write!(socket, "GET /{path} HTTP/1.1\r\nHost: {host}\r\n\r\n").expect("expected a sent request");
-    let mut answer = String::new();
-    socket.read_to_string(&mut answer).expect("expected a page that is not compressed");
-    assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
-    // echo -ne '\x89MCAP0\r\n' | base64
-    let element = "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"1\">iU1DQVAwDQo=</script>";
-    assert!(answer.contains(element), "{answer}");
+    let link = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("open http://").map(str::to_owned));
+    let link = link.expect("expected a link");
+    let (host, code) = link.split_once("/#code=").expect("expected a code");
+    let exchange = |request: &str| {
+        let mut socket = TcpStream::connect(host).expect("expected a connection");
+        write!(socket, "{request}").expect("expected a sent request");
+        let mut answer = Vec::new();
+        socket.read_to_end(&mut answer).expect("expected an answer");
+        let answer: String = answer.into_iter().map(char::from).collect();
+        let (head, body) = answer.split_once("\r\n\r\n").expect("expected a head");
+        assert!(head.starts_with("HTTP/1.1 200"), "{head}");
+        body.to_owned()
+    };
+    let page = exchange(&format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"));
+    assert!(page.contains("data-path=\"recording\" data-slow=\"1\""));
+    let length = code.len();
+    let session =
+        exchange(&format!("POST /session HTTP/1.1\r\nHost: {host}\r\nContent-Length: {length}\r\n\r\n{code}"));
+    let authorization = format!("Authorization: Bearer {session}");
+    let recording = exchange(&format!("GET /recording HTTP/1.1\r\nHost: {host}\r\n{authorization}\r\n\r\n"));
+    assert_eq!(recording, RECORDING);
     let pid = i32::try_from(server.id()).ok().and_then(Pid::from_raw).expect("expected a process");
     kill_process(pid, Signal::TERM).expect("expected a running server");
     assert!(server.wait().expect("expected the end of the server").success());

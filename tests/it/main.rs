@@ -56,6 +56,7 @@ mod streams;
 mod tolerance;
 mod unix_sockets;
 mod viewer_port;
+mod viewer_sessions;
 mod websocket;
 mod websocket_client;
 mod writers;

@@ -1,5 +1,4 @@
-//! HTTP/1.1 on the port of the server: the viewer's page, the health of the server, and the checks of token, Host and
-//! Origin.
+//! HTTP/1.1 on the port of the server: the viewer's page, the health of the server, and the checks of Host and Origin.
 
 use std::time::Duration;
 
@@ -12,15 +11,15 @@ use v1::scene_service_client::SceneServiceClient;
 use v1::server_service_client::ServerServiceClient;
 
 use crate::service_harness::{SILENCE_LIMIT, Server, with_timeout};
-use crate::websocket_client::{TOKEN, WebSocketClient, authority, handshake, start_server};
+use crate::websocket_client::{WebSocketClient, authority, handshake};
 
 /// An answer in HTTP/1.1.
 #[derive(Debug)]
-struct Answer {
-    status: u16,
+pub(crate) struct Answer {
+    pub(crate) status: u16,
     /// Lower case.
     head: String,
-    body: Vec<u8>,
+    pub(crate) body: Vec<u8>,
 }
 
 impl Answer {
@@ -34,7 +33,7 @@ async fn connect(server: &Server) -> TcpStream {
 }
 
 /// Sends bytes and reads the answer up to the end of the connection. `None` if there is no answer.
-async fn exchange(server: &Server, request: &str) -> Option<Answer> {
+pub(crate) async fn exchange(server: &Server, request: &str) -> Option<Answer> {
     let mut socket = connect(server).await;
     socket.write_all(request.as_bytes()).await.ok();
     let mut bytes = Vec::new();
@@ -52,10 +51,9 @@ async fn get(server: &Server, path: &str, host: &str, headers: &str) -> Answer {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn page_needs_token_and_own_host() {
-    let server = start_server(|config| config).await;
-    let page_path = format!("/?token={TOKEN}");
-    let page = get(&server, &page_path, authority(&server), "").await;
+async fn page_needs_own_host() {
+    let server = Server::start_with(|config| config).await;
+    let page = get(&server, "/", authority(&server), "").await;
     assert_eq!(page.status, 200, "{page:?}");
     assert!(page.body.starts_with(&[0x1f, 0x8b]), "expected gzip");
     for header in ["content-encoding: gzip", "cache-control: no-store", "referrer-policy: no-referrer"] {
@@ -65,18 +63,15 @@ async fn page_needs_token_and_own_host() {
     assert!(page.head.contains("content-security-policy: default-src 'none';"), "{}", page.head);
     assert!(page.head.contains(&connect_source), "{}", page.head);
     // Through a tunnel, the page is requested with another port.
-    assert_eq!(get(&server, &page_path, "localhost:7", "").await.status, 200);
+    assert_eq!(get(&server, "/", "localhost:7", "").await.status, 200);
 
-    let token_path = |token: &str| format!("/?token={token}");
-    let other_token = TOKEN.replace('0', "1");
     for (path, host, headers, status) in [
-        ("/", "localhost", "", 403),
-        (&token_path(&other_token), "localhost", "", 403),
-        (&token_path(""), "localhost", "", 403),
-        (&page_path, "evil.example", "", 403),
-        (&page_path, "localhost", "Origin: http://evil.example\r\n", 403),
-        (&page_path, "localhost", "Host: localhost\r\n", 403),
-        (&format!("/websocket?token={TOKEN}"), "localhost", "", 400),
+        ("/", "evil.example", "", 403),
+        ("/", "localhost", "Origin: http://evil.example\r\n", 403),
+        ("/", "localhost", "Host: localhost\r\n", 403),
+        ("/websocket", "localhost", "", 400),
+        ("/session", "localhost", "", 405),
+        ("/recording", "localhost", "", 404),
         ("/favicon.ico", "localhost", "", 404),
         ("/index.html", "localhost", "", 404),
     ] {
@@ -84,18 +79,17 @@ async fn page_needs_token_and_own_host() {
         assert_eq!(answer.status, status, "{path} {host} {headers}");
         assert!(answer.has_header("connection: close") && answer.has_header("x-content-type-options: nosniff"));
         let text = String::from_utf8_lossy(&answer.body);
-        assert!(!text.contains(TOKEN));
         assert_eq!(text.contains("modalcast serve"), status == 403, "{text}");
     }
-    let post = format!("POST {page_path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\nab");
-    assert_eq!(exchange(&server, &post).await.expect("expected an answer").status, 405);
-    let no_host = format!("GET {page_path} HTTP/1.0\r\n\r\n");
-    assert_eq!(exchange(&server, &no_host).await.expect("expected an answer").status, 403);
+    let post = "POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\nab";
+    assert_eq!(exchange(&server, post).await.expect("expected an answer").status, 405);
+    let no_host = "GET / HTTP/1.0\r\n\r\n";
+    assert_eq!(exchange(&server, no_host).await.expect("expected an answer").status, 403);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn websocket_needs_token_origin_and_subprotocol() {
-    let server = start_server(|config| config).await;
+async fn websocket_needs_origin_and_subprotocol() {
+    let server = Server::start_with(|config| config).await;
     let own_origin = format!("http://{}", authority(&server));
     for (name, value, is_accepted) in [
         ("origin", own_origin.as_str(), true),
@@ -113,43 +107,21 @@ async fn websocket_needs_token_origin_and_subprotocol() {
             assert!([400, 403].contains(&answer.status().as_u16()));
         }
     }
-    // Without a token.
-    let request = "GET /websocket HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n\
-                   Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: modalcast.v1\r\n\
-                   Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n";
-    assert_eq!(exchange(&server, request).await.expect("expected an answer").status, 403);
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn health_needs_no_token() {
-    let server = start_server(|config| config).await;
+async fn health_needs_no_credential() {
+    let server = Server::start_with(|config| config).await;
     let answer = get(&server, "/healthz", authority(&server), "").await;
     assert_eq!((answer.status, &answer.body[..]), (200, &b"serving\n"[..]));
     assert_eq!(get(&server, "/healthz", "evil.example", "").await.status, 403);
 }
 
-/// Two servers have different tokens. A gRPC client receives the token of its server.
-#[tokio::test(flavor = "multi_thread")]
-async fn token_is_random_and_known_to_grpc_clients() {
-    let mut paths = Vec::new();
-    for _ in 0..2 {
-        let server = Server::start_default().await;
-        let mut client = ServerServiceClient::new(server.channel().await);
-        let info = with_timeout(client.get_server_info(v1::GetServerInfoRequest {})).await.expect("expected an answer");
-        let info = info.into_inner();
-        assert!(info.features().any(|feature| feature == v1::Feature::Viewer));
-        assert_eq!(get(&server, &info.viewer_url_path, "localhost", "").await.status, 200);
-        paths.push(info.viewer_url_path);
-    }
-    assert_eq!(paths[0].len(), "/?token=".len() + 32, "{paths:?}");
-    assert_ne!(paths[0], paths[1]);
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn viewer_can_be_turned_off() {
-    let server = start_server(|config| Config { viewer: false, ..config }).await;
-    let request = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost\r\n\r\n");
-    assert!(exchange(&server, &request).await.is_none());
+    let server = Server::start_with(|config| Config { viewer: false, ..config }).await;
+    let request = "GET / HTTP/1.1\r\nHost: localhost\r\n\r\n";
+    assert!(exchange(&server, request).await.is_none());
     let mut client = ServerServiceClient::new(server.channel().await);
     let info = with_timeout(client.get_server_info(v1::GetServerInfoRequest {})).await.expect("expected an answer");
     assert_eq!(info.get_ref().viewer_url_path, "");
@@ -159,11 +131,11 @@ async fn viewer_can_be_turned_off() {
 /// Connections with slow, unfinished or large heads are closed. Afterwards, another client is served.
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_and_large_requests_are_closed() {
-    let server = start_server(|config| Config { handshake_timeout: SILENCE_LIMIT, ..config }).await;
+    let server = Server::start_with(|config| Config { handshake_timeout: SILENCE_LIMIT, ..config }).await;
     let trickle = async {
         let mut socket = connect(&server).await;
-        let head = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost\r\n");
-        socket.write_all(head.as_bytes()).await.expect("expected an open connection");
+        let head = b"GET / HTTP/1.1\r\nHost: localhost\r\n";
+        socket.write_all(head).await.expect("expected an open connection");
         // A byte at a time does not extend the deadline.
         while socket.write_all(b"X").await.is_ok() {
             tokio::time::sleep(Duration::from_millis(50)).await;
@@ -195,7 +167,7 @@ async fn slow_and_large_requests_are_closed() {
 #[tokio::test(flavor = "multi_thread")]
 async fn full_server_closes_browsers_without_calls() {
     let limits = |config| Config { connections: 4, ..config };
-    let server = start_server(limits).await;
+    let server = Server::start_with(limits).await;
     let mut silent = connect(&server).await;
     silent.write_all(b"GET /").await.expect("expected an open connection");
     let mut websockets = Vec::new();
@@ -220,10 +192,11 @@ async fn unix_socket_serves_the_viewer() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
     let path = folder.path().join("socket");
     let listen = ListenAddress::Unix(path.clone());
-    let _server = start_server(|config| Config { listen: [config.listen, vec![listen]].concat(), ..config }).await;
+    let _server =
+        Server::start_with(|config| Config { listen: [config.listen, vec![listen]].concat(), ..config }).await;
     let mut socket = tokio::net::UnixStream::connect(&path).await.expect("expected a connection");
-    let request = format!("GET /?token={TOKEN} HTTP/1.1\r\nHost: localhost:8000\r\n\r\n");
-    socket.write_all(request.as_bytes()).await.expect("expected an open connection");
+    let request = b"GET / HTTP/1.1\r\nHost: localhost:8000\r\n\r\n";
+    socket.write_all(request).await.expect("expected an open connection");
     let mut answer = Vec::new();
     with_timeout(socket.read_to_end(&mut answer)).await.expect("expected an answer");
     assert!(answer.starts_with(b"HTTP/1.1 200"));

@@ -16,9 +16,7 @@ use v1::drive_scene_request::Kind as RequestKind;
 use v1::drive_scene_response::Kind as ResponseKind;
 
 use crate::service_harness::{SILENCE_LIMIT, Server, minimum_step, step, with_timeout};
-use crate::websocket_client::{
-    CANCEL, CREDIT, CallResult, END, MESSAGE, START, WebSocketClient, authority, call_grpc, start_server,
-};
+use crate::websocket_client::{CANCEL, CREDIT, CallResult, END, MESSAGE, START, WebSocketClient, authority, call_grpc};
 
 const DRIVE: &str = "/modalcast.v1.StepService/DriveScene";
 const LIST: &str = "/modalcast.v1.SceneService/ListScenes";
@@ -33,7 +31,7 @@ const SERVER_CREDIT: usize = 4 << 20;
 const CLIENT_CREDIT: usize = 1 << 20;
 
 async fn default_server() -> Server {
-    start_server(|config| config).await
+    Server::start_with(|config| config).await
 }
 
 fn describe(scene: &str) -> v1::DescribeSceneRequest {
@@ -444,13 +442,14 @@ async fn fragmented_messages_are_accepted() {
 #[tokio::test(flavor = "multi_thread")]
 async fn incomplete_messages_and_silent_clients_are_disconnected() {
     let short = Duration::from_millis(200);
-    let server = start_server(|config| Config { message_timeout: short, ..config }).await;
+    let server = Server::start_with(|config| Config { message_timeout: short, ..config }).await;
     assert_closed(&server, &[fragment(Data::Binary, &[0; 1000], false)], 1008).await;
-    let server = start_server(|config| Config { first_request_timeout: short, ..config }).await;
+    let server = Server::start_with(|config| Config { first_request_timeout: short, ..config }).await;
     assert_closed(&server, &[], 1008).await;
     // A client that does not answer pings.
     let keepalive_interval = Duration::from_millis(100);
-    let server = start_server(|config| Config { keepalive_interval, keepalive_timeout: keepalive_interval, ..config });
+    let server =
+        Server::start_with(|config| Config { keepalive_interval, keepalive_timeout: keepalive_interval, ..config });
     let server = server.await;
     let client = WebSocketClient::connect(&server).await;
     let mut socket = client.stream.into_inner();
@@ -463,7 +462,7 @@ async fn incomplete_messages_and_silent_clients_are_disconnected() {
 #[tokio::test(flavor = "multi_thread")]
 async fn half_sent_messages_count_against_the_receive_budget() {
     let limits = |config| Config { connection_receive_bytes: 1 << 20, receive_bytes: 3 << 19, ..config };
-    let server = start_server(limits).await;
+    let server = Server::start_with(limits).await;
     let mut clients = Vec::new();
     for bytes in [1000 << 10, 500 << 10] {
         let mut client = WebSocketClient::connect(&server).await;
@@ -489,7 +488,7 @@ async fn half_sent_messages_count_against_the_receive_budget() {
 async fn client_that_never_reads_is_cut_off() {
     let (reply_bytes, reply_timeout) = (6 << 20, SILENCE_LIMIT);
     let limits = |config| Config { reply_bytes, connection_reply_bytes: reply_bytes, reply_timeout, ..config };
-    let server = start_server(limits).await;
+    let server = Server::start_with(limits).await;
     server.open("sheet").await;
     let mut stalled = Vec::new();
     for _ in 0..3 {

@@ -16,15 +16,13 @@ use tonic::transport::Channel;
 
 use crate::service_harness::{Server, with_timeout};
 
-/// The token of servers of [`start_server`].
-pub(crate) const TOKEN: &str = "test-token-0123456789";
-
 // Kinds of messages of the client.
 pub(crate) const START: u8 = 0;
 pub(crate) const MESSAGE: u8 = 1;
 pub(crate) const END: u8 = 2;
 pub(crate) const CANCEL: u8 = 3;
 pub(crate) const CREDIT: u8 = 4;
+pub(crate) const SESSION: u8 = 6;
 /// The kind of the server's last message of a call.
 pub(crate) const STATUS: u8 = 5;
 
@@ -218,13 +216,13 @@ fn envelope(id: u32, kind: u8, payload: &[u8]) -> Vec<u8> {
     [&id.to_le_bytes()[..], &[kind], payload].concat()
 }
 
-/// Makes the handshake of a WebSocket with the token and further headers.
+/// Makes the handshake of a WebSocket with further headers.
 pub(crate) async fn handshake(
     socket: TcpStream,
     server: &Server,
     headers: &[(&'static str, &str)],
 ) -> Result<WebSocketStream<TcpStream>, WebSocketError> {
-    let url = format!("ws://{}/websocket?token={TOKEN}", authority(server));
+    let url = format!("ws://{}/websocket", authority(server));
     let mut request = url.into_client_request().expect("expected a valid request");
     request.headers_mut().insert("sec-websocket-protocol", "modalcast.v1".parse().expect("expected a header"));
     for (name, value) in headers {
@@ -263,12 +261,4 @@ pub(crate) async fn call_grpc(mut channel: Channel, path: &str, request: &impl p
         details => tonic_types::Status::decode(details).expect("expected a status"),
     };
     CallResult { messages, status }
-}
-
-/// Starts a server with the token [`TOKEN`].
-pub(crate) async fn start_server(
-    change: impl FnOnce(modalcast::config::Config) -> modalcast::config::Config,
-) -> Server {
-    let viewer_token = Some(TOKEN.parse().expect("expected a valid token"));
-    Server::start_with(|config| change(modalcast::config::Config { viewer_token, ..config })).await
 }

@@ -75,7 +75,7 @@ ROWS = {
     24: ("10,000 simulated network faults", None),
     25: ("CUDA kernels are clean under compute-sanitizer", None),
     26: ("interoperation with other gRPC implementations", None),
-    27: ("authentication and exposure", None),
+    27: ("authentication and exposure", 17),
     28: ("shared memory is safe", None),
     29: ("no dependency below a version with a known weakness", None),
     30: ("no slow-down", None),

@@ -26,12 +26,13 @@ class Server:
         state=None,
         environment=None,
         address_space=resource.RLIM_INFINITY,
+        # Most attackers are programs of the owner, against whom credentials do not protect.
+        authentication=("--no-auth",),
     ):
         self.folder = tempfile.TemporaryDirectory(prefix="modalcast-siege-")
         self.state = Path(state or self.folder.name) / "state"
         self.log_path = Path(self.folder.name) / "log"
-        # The attackers are programs of the owner, against whom credentials do not protect.
-        command = [str(program), "serve", "--no-auth", "--listen", "127.0.0.1:0", "--backend", backend]
+        command = [str(program), "serve", *authentication, "--listen", "127.0.0.1:0", "--backend", backend]
         command += ["--renderer", renderer, "--state", str(self.state)]
         command += ["--scenes", str(scenes)] if scenes else []
         self.process = subprocess.Popen(

@@ -27,7 +27,6 @@ ITEM = 16
 
 CLIENTS = 16
 SCENES = ["scene-0", "scene-1", "scene-2"]
-TOKEN = "0123456789abcdef"
 
 # Seconds of a client's life.
 MIN_LIFE, MAX_LIFE = 1.0, 10.0
@@ -112,7 +111,7 @@ class Population:
 
         try:
             add = lambda steps: self.counter.add(slot, steps)  # noqa: E731
-            Life(self.server, TOKEN, SCENES, slot, seed, self.has_renderer, add).live(life)
+            Life(self.server, SCENES, slot, seed, self.has_renderer, add).live(life)
         except OSError:
             # The server may close the connection of a client that does not read.
             pass
@@ -160,9 +159,8 @@ def soak(program, seconds, leaks=False, renderer="software", backend="cpu", heap
         heap.write_bytes(bytes(8))
         environment = {"LD_PRELOAD": str(heap_library or build_heap_library(folder)), "SOAK_HEAP": str(heap)}
         environment |= {"SOAK_STEPS": str(folder / "steps")} if leaks else {}
-        flags = ["--viewer-token", TOKEN]
         with Server(
-            program, *flags, scenes=scenes, backend=backend, renderer=renderer, environment=environment
+            program, scenes=scenes, backend=backend, renderer=renderer, environment=environment
         ) as server:
             open_scenes(server)
             return observe(server, heap, counter, seconds, renderer != "off")
@@ -228,7 +226,7 @@ def write_model(folder):
 def open_scenes(server):
     from soak_clients import Life, scenes_pb2
 
-    client = Life(server, TOKEN, SCENES, 0, 0, False, None)
+    client = Life(server, SCENES, 0, 0, False, None)
     for name in SCENES:
         request = scenes_pb2.OpenSceneRequest(source="grid.obj", scene=name)
         call = client.start("/modalcast.v1.SceneService/OpenScene", request)

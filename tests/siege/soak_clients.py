@@ -24,9 +24,8 @@ RANK = 4
 class Life:
     """A client during its life. `count_steps` is called with the number of steps that the server has acknowledged."""
 
-    def __init__(self, server, token, scenes, slot, seed, has_renderer, count_steps):
+    def __init__(self, server, scenes, slot, seed, has_renderer, count_steps):
         self.server = server
-        self.token = token
         self.scenes = scenes
         self.slot = slot
         self.random = random.Random(seed)
@@ -34,7 +33,7 @@ class Life:
         self.count_steps = count_steps
         self.last_call = 0
         self.buffer = b""
-        self.socket = WebSocket(server, token)
+        self.socket = WebSocket(server)
 
     def live(self, seconds):
         """Uses the server in one way for some seconds."""

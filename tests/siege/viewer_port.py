@@ -17,9 +17,6 @@ from websocket import WebSocket
 
 ITEM = 14
 
-TOKEN = "0123456789abcdef"
-VIEWER = ["--viewer-token", TOKEN]
-
 # Seconds within which a new client must be served.
 MAX_SERVICE_SECONDS = 1.0
 
@@ -48,14 +45,14 @@ UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "400000
 
 
 def other_pages(program):
-    """Requests that a page of another site can make, or that guess the token."""
-    with Server(program, *VIEWER) as server:
+    """Requests that a page of another site can make, and guesses of a link's code."""
+    with Server(program) as server:
         own = server.address  # The host that the viewer accepts.
-        requests = []
-        for path, upgrade in [("/", False), ("/websocket", True)]:
-            for token in [None, "", "1123456789abcdef", TOKEN[:-1]]:
-                query = "" if token is None else f"?token={token}"
-                requests.append(websocket.request(server, path + query, upgrade=upgrade))
+        requests = [
+            websocket.request(server, "/session", own, f"http://{own}", body=code)
+            for code in ["", "0" * 64, "x" * 512, "1123456789abcdef"]
+        ]
+        for path, upgrade in [("/", False), ("/websocket", True), ("/recording", False)]:
             for host, origin in [
                 ("evil.example", None),
                 (f"evil.example:{server.port}", f"http://evil.example:{server.port}"),
@@ -64,28 +61,27 @@ def other_pages(program):
                 (own, f"https://{own}"),
                 (own, f"http://localhost:{server.port + 1}"),
             ]:
-                requests.append(websocket.request(server, f"{path}?token={TOKEN}", host, origin, upgrade))
-        answers = [websocket.status_of(server, head) for head in requests]
+                requests.append(websocket.request(server, path, host, origin, upgrade))
+        requests.append(websocket.request(server, "/session", own, "http://evil.example", body="0" * 64))
+        answers = [websocket.status_of(server, request) for request in requests]
         control = [
-            websocket.status_of(server, websocket.request(server, f"/?token={TOKEN}")),
-            websocket.status_of(
-                server, websocket.request(server, f"/websocket?token={TOKEN}", own, f"http://{own}", True)
-            ),
+            websocket.status_of(server, websocket.request(server, "/")),
+            websocket.status_of(server, websocket.request(server, "/websocket", own, f"http://{own}", True)),
         ]
     return Result(
         ITEM,
-        "web pages of other sites and clients without the token get neither the viewer nor a WebSocket",
+        "web pages of other sites and wrong codes get neither the viewer, a session nor a WebSocket",
         f"403 for {len(answers)} requests",
         ", ".join(f"{answers.count(status)} x {status}" for status in sorted(set(answers))),
         set(answers) == {403},
-        f"own page and WebSocket with the token: {control}",
+        f"own page and WebSocket: {control}",
         control == [200, 101],
     )
 
 
 def lockout(program, connect):
     """The slowest service while CONNECTIONS connections that `connect` opens exist."""
-    with Server(program, *VIEWER) as server:
+    with Server(program) as server:
         connections = []
         for _ in range(CONNECTIONS):
             try:
@@ -101,23 +97,23 @@ def lockout(program, connect):
 def slow_head(server):
     """Sends an incomplete HTTP head."""
     connection = socket.create_connection(("127.0.0.1", server.port), timeout=10)
-    connection.sendall(f"GET /?token={TOKEN} HTTP/1.1\r\nHost: ".encode())
+    connection.sendall("GET / HTTP/1.1\r\nHost: ".encode())
     return connection
 
 
 def silent_websocket(server):
-    return WebSocket(server, TOKEN)
+    return WebSocket(server)
 
 
 def websocket_with_a_call(server):
-    connection = WebSocket(server, TOKEN)
+    connection = WebSocket(server)
     connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
     return connection
 
 
 def trickled_head(program):
     """Sends an HTTP head one byte at a time. Returns the seconds until the server ends the connection."""
-    with Server(program, *VIEWER) as server:
+    with Server(program) as server:
         connection, start = slow_head(server), time.monotonic()
         try:
             while time.monotonic() - start < 60:
@@ -162,11 +158,11 @@ def send_half(connection, is_fragmented):
 
 def half_sent(program, flags):
     """Growth of the memory during half-sent messages, and the slowest service."""
-    with Server(program, *VIEWER, *flags) as server:
+    with Server(program, *flags) as server:
         for _ in range(3):
             time_to_serve(server, 10)
         memory, slowest = Peak(server.memory), 0.0
-        connections = [WebSocket(server, TOKEN) for _ in range(HALF_SENT_CONNECTIONS)]
+        connections = [WebSocket(server) for _ in range(HALF_SENT_CONNECTIONS)]
         targets = [(connection, index % 2 == 0) for index, connection in enumerate(connections)]
         threads = [threading.Thread(target=send_half, args=target) for target in targets]
         for thread in threads:
@@ -199,12 +195,12 @@ def unread(program, flags):
     request = scenes_pb2.DescribeSceneRequest(scene="grid", arrays=ALL_ARRAYS).SerializeToString()
     with tempfile.TemporaryDirectory() as folder:
         write_grid(Path(folder) / "grid.obj", SIDE)
-        with Server(program, *VIEWER, *flags, scenes=folder) as server:
+        with Server(program, *flags, scenes=folder) as server:
             with Client(server) as client:
                 client.open_scene("grid.obj", "grid")
             describe_whole(server)
             memory, slowest = Peak(server.memory), 0.0
-            connections = [WebSocket(server, TOKEN, receive_buffer=4096) for _ in range(UNREAD_CONNECTIONS)]
+            connections = [WebSocket(server, receive_buffer=4096) for _ in range(UNREAD_CONNECTIONS)]
             for connection in connections:
                 for call in range(UNREAD_CALLS):
                     connection.send(websocket.start_call(call + 1, DESCRIBE_SCENE, request))
@@ -243,7 +239,7 @@ FLOODS = [
 
 def connect_for_flood(server, frame):
     """A WebSocket with an open call, so that it has a message to continue and to give credit to."""
-    connection = WebSocket(server, TOKEN)
+    connection = WebSocket(server)
     connection.send(websocket.start_call(1, HEALTH_WATCH, b""))
     if frame == EMPTY_FRAGMENT:
         connection.send(websocket.frame(websocket.BINARY, b"", is_last=False))
@@ -252,7 +248,7 @@ def connect_for_flood(server, frame):
 
 def small_frames(program):
     promise = "floods of small WebSocket frames end their connection"
-    with Server(program, *VIEWER) as server:
+    with Server(program) as server:
         return check_floods(ITEM, promise, server, FLOODS, lambda frame: connect_for_flood(server, frame))
 
 

@@ -20,15 +20,16 @@ CREDIT = 4
 MASK = b"\x01\x02\x03\x04"
 
 
-def request(server, path, host=None, origin=None, upgrade=False):
-    """The head of a GET request."""
-    lines = [f"GET {path} HTTP/1.1", f"Host: {server.address if host is None else host}"]
+def request(server, path, host=None, origin=None, upgrade=False, body=None):
+    """A GET request, or a POST request with a body."""
+    lines = [f"{'GET' if body is None else 'POST'} {path} HTTP/1.1", f"Host: {server.address if host is None else host}"]
     lines += [f"Origin: {origin}"] if origin else []
     if upgrade:
         key = base64.b64encode(bytes(16)).decode()
         lines += ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
         lines += [f"Sec-WebSocket-Key: {key}", "Sec-WebSocket-Protocol: modalcast.v1"]
-    return ("\r\n".join(lines) + "\r\n\r\n").encode()
+    lines += [] if body is None else [f"Content-Length: {len(body)}"]
+    return ("\r\n".join(lines) + "\r\n\r\n" + (body or "")).encode()
 
 
 def status_of(server, head):
@@ -63,13 +64,13 @@ def start_call(call, path, content):
 class WebSocket:
     """A connection after its handshake. Nothing is read unless `receive` is called."""
 
-    def __init__(self, server, token, receive_buffer=None):
+    def __init__(self, server, receive_buffer=None):
         self.socket = socket.socket()
         if receive_buffer:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
         self.socket.settimeout(10)
         self.socket.connect(("127.0.0.1", server.port))
-        self.socket.sendall(request(server, f"/websocket?token={token}", upgrade=True))
+        self.socket.sendall(request(server, "/websocket", upgrade=True))
         answer = b""
         while not answer.endswith(b"\r\n\r\n"):
             # One byte at a time, so that no frame is read.

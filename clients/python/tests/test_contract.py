@@ -152,6 +152,8 @@ def use_every_call(client: mc.Client, folder: Path) -> None:
     tree = client.open("tree")
     tree.describe(["uvs"], textures=True)
     tree.modes("trunk", [0])
+    tree.view()
+    tree.share()
     use_files(client, folder)
     scene = client.upload(beam_builder("contract"))
     scene.describe(["modes"], cache=str(folder / "cache"))

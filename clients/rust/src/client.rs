@@ -217,6 +217,18 @@ impl Client {
         self.reply(self.scenes().delete_scene(request).await).map(drop)
     }
 
+    /// Makes a link to the viewer, which is valid once. `principal` is the one whose rights the link gives; empty: the
+    /// caller's own. Returns the path and fragment, to which the caller prepends scheme, host and port of the server.
+    ///
+    /// # Errors
+    /// `Status` if the server has no viewer, or the caller may not name this principal; `Connect` if the connection is
+    /// lost.
+    pub async fn create_viewer_link(&self, principal: &str) -> Result<String> {
+        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
+        let request = v1::CreateViewerLinkRequest { principal: principal.to_owned() };
+        self.reply(service.create_viewer_link(request).await).map(|reply| reply.url_path)
+    }
+
     /// Shares a scene with the principals of these names (`"*"`: all), in place of those with whom it was shared. Others
     /// than its owner do not see a scene that is not shared.
     ///

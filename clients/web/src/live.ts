@@ -13,6 +13,14 @@ import { PROTOCOL_VERSION, Server, type UploadedFile } from "./source/server";
 import * as format from "./ui/format";
 import { Channel } from "./wire/channel";
 import { RpcError, StatusCode } from "./wire/rpc_error";
+import {
+    type CodeResult,
+    forgetSession,
+    hasCode,
+    redeemCode,
+    sessionToken,
+    UNKNOWN_SESSION_CODE,
+} from "./wire/session";
 
 /** Milliseconds until the next attempt to connect: doubled after each one, up to the limit. */
 const FIRST_RETRY_MS = 250;
@@ -41,15 +49,28 @@ export class LiveViewer {
     private isConnected = false;
     private isStopped = false;
     private isUploading = false;
+    /** What has become of the code in the last link. */
+    private code: CodeResult = "none";
     /** The list of scenes that is offered, as JSON; empty while a scene is shown. */
     private offered = "";
 
     constructor(private readonly app: App) {
-        window.addEventListener("hashchange", () => this.switchScene());
+        window.addEventListener("hashchange", () => {
+            if (hasCode()) this.useNewLink();
+            else this.switchScene();
+        });
         app.bar.onScene = (value) => void this.select(value);
     }
 
     private server: Server | null = null;
+    /** Ends the wait for the next attempt to connect. */
+    private connectNow: () => void = () => {};
+
+    /** Connects again with the session of a link that was opened in this tab. */
+    private useNewLink(): void {
+        this.server?.channel.close();
+        this.connectNow();
+    }
 
     /** Ends the connection, for example because a recording is shown in its place. */
     stop(): void {
@@ -65,7 +86,9 @@ export class LiveViewer {
         while (!this.isStopped) {
             try {
                 app.bar.setConnection("warn", "connecting");
-                const channel = await Channel.open(webSocketUrl());
+                const code = await redeemCode();
+                if (code !== "none") this.code = code;
+                const channel = await Channel.open(webSocketUrl(), sessionToken());
                 retry = FIRST_RETRY_MS;
                 await this.serve(new Server(channel, cache));
             } catch (error) {
@@ -76,7 +99,13 @@ export class LiveViewer {
                     app.cover.showMessage("The viewer cannot go on", error.message);
                     return;
                 }
-                const reason = await this.explain(error);
+                if (this.server?.channel.closeCode === UNKNOWN_SESSION_CODE) {
+                    // The server has started again. Without a session it tells what it expects.
+                    forgetSession();
+                    this.server = null;
+                    continue;
+                }
+                const reason = this.explain(error);
                 if (!app.model) app.cover.showMessage(reason.title, reason.text, reason.command);
                 else
                     app.notices.show("connection", `${reason.title}. ${reason.text}`, { severity: "bad", duration: 0 });
@@ -84,7 +113,10 @@ export class LiveViewer {
             this.server = null;
             this.offered = "";
             app.bar.setConnection("bad", this.isConnected ? "reconnecting" : "not connected");
-            await new Promise((resolve) => setTimeout(resolve, retry));
+            await new Promise<void>((resolve) => {
+                this.connectNow = resolve;
+                setTimeout(resolve, retry);
+            });
             retry = Math.min(2 * retry, LONGEST_RETRY_MS);
         }
     }
@@ -305,23 +337,18 @@ export class LiveViewer {
         }
     }
 
-    /** Why there is no connection, in words for the user. The browser hides the status of a failed WebSocket. */
-    private async explain(error: unknown): Promise<{ title: string; text: string; command?: string }> {
+    /** Why there is no connection, in words for the user. */
+    private explain(error: unknown): { title: string; text: string; command?: string } {
         if (!(error instanceof RpcError)) {
             console.warn(error);
             return { title: "The viewer failed", text: error instanceof Error ? error.message : String(error) };
         }
-        try {
-            const response = await fetch(location.pathname + location.search, { cache: "no-store" });
-            if (response.status === 401 || response.status === 403) {
-                return {
-                    title: "The address has no valid token",
-                    text: "The server has started again and has a new token. Open the address that it printed.",
-                    command: "modalcast serve  # prints the address of the viewer",
-                };
-            }
-        } catch {
-            // No server answers.
+        if (error.code === StatusCode.unauthenticated) {
+            const text =
+                this.code === "rejected"
+                    ? "The link was used before or has expired: each is valid once. Make another one on the server's machine."
+                    : "The server has started again, or this address is no link. Make a link on the server's machine.";
+            return { title: "This page needs a new link", text, command: "modalcast link" };
         }
         return {
             title: "The server does not answer",
@@ -331,9 +358,11 @@ export class LiveViewer {
     }
 }
 
-/** The WebSocket beside this page, with its token. */
+/** The WebSocket beside this page. */
 function webSocketUrl(): string {
-    const token = new URLSearchParams(location.search).get("token") ?? "";
-    const protocol = location.protocol === "https:" ? "wss:" : "ws:";
-    return `${protocol}//${location.host}/websocket?token=${encodeURIComponent(token)}`;
+    const url = new URL("websocket", location.href);
+    url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
+    url.search = "";
+    url.hash = "";
+    return url.href;
 }

@@ -22,7 +22,7 @@ function start(): void {
             void player.openFile(first.path, first.file);
         } else void live.upload(files);
     });
-    if (player.openEmbedded()) return;
+    if (player.openEmbedded() || player.openServed()) return;
     if (location.protocol === "file:")
         app.cover.showMessage("No recording", "Drop a recording, a file that ends in .mcap, onto this page.");
     else void live.run();

@@ -4,6 +4,7 @@ import type { App } from "./app";
 import { Playback } from "./source/playback";
 import { decodeBase64, type Recording, readRecording } from "./source/recording";
 import { Timeline } from "./ui/timeline";
+import { redeemCode, sessionToken } from "./wire/session";
 
 export class RecordingPlayer {
     private timeline: Timeline | null = null;
@@ -26,6 +27,34 @@ export class RecordingPlayer {
         const slow = Number(element.dataset["slow"]);
         this.open(document.title, () => decodeBase64(text), slow > 0 && Number.isFinite(slow) ? slow : null);
         return true;
+    }
+
+    /** Plays the recording of the server, if the page names one. False if it names none. */
+    openServed(): boolean {
+        const element = document.getElementById("recording");
+        const path = element?.dataset["path"];
+        if (!element || !path) return false;
+        element.remove();
+        const slow = Number(element.dataset["slow"]);
+        void this.fetchRecording(path, slow > 0 && Number.isFinite(slow) ? slow : null);
+        return true;
+    }
+
+    private async fetchRecording(path: string, slow: number | null): Promise<void> {
+        const { cover } = this.app;
+        try {
+            await redeemCode();
+            const headers = { authorization: `Bearer ${sessionToken() ?? ""}` };
+            const response = await fetch(path, { headers, cache: "no-store" });
+            if (response.status === 403) {
+                const text = "A link is valid once. Start `modalcast view` again for another one.";
+                cover.showMessage("This page needs a new link", text);
+            } else if (!response.ok) throw new Error(`the server answers with status ${response.status}`);
+            else this.open(document.title, new Uint8Array(await response.arrayBuffer()), slow);
+        } catch (error) {
+            const text = error instanceof Error ? error.message : String(error);
+            cover.showMessage("The recording cannot be loaded", text);
+        }
     }
 
     /** @param slow Initial slow motion factor; null: by the lowest frequency of the scene. */

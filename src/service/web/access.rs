@@ -1,18 +1,14 @@
-//! Checks which requests may use the viewer. Any web page can send requests to a port of its user's machine, so a
-//! request needs the token, and its `Host` and `Origin` must be those of this server.
+//! Checks the site of requests. Any web page can send requests to a port of its user's machine, so `Host` and `Origin` must
+//! be those of this server.
 
-use std::hint::black_box;
 use std::net::IpAddr;
 
 use tonic::codegen::http::uri::Authority;
-use tonic::codegen::http::{HeaderMap, Uri, header};
+use tonic::codegen::http::{HeaderMap, header};
 
-use crate::config::ViewerToken;
-
-/// Who may use the viewer.
+/// Which sites may use the viewer.
 #[derive(Debug)]
 pub(in crate::service) struct Access {
-    token: ViewerToken,
     /// The name of this machine, if other machines can connect.
     host_name: Option<String>,
 }
@@ -22,7 +18,6 @@ pub(in crate::service) struct Access {
 pub(super) enum Denied {
     Host,
     Origin,
-    Token,
 }
 
 impl Denied {
@@ -31,14 +26,13 @@ impl Denied {
         match self {
             Self::Host => "a Host header that names this server by its address or by localhost",
             Self::Origin => "no Origin header, or that of this server",
-            Self::Token => "the token of this server",
         }
     }
 }
 
 impl Access {
-    pub(in crate::service) const fn new(token: ViewerToken, host_name: Option<String>) -> Self {
-        Self { token, host_name }
+    pub(in crate::service) const fn new(host_name: Option<String>) -> Self {
+        Self { host_name }
     }
 
     /// Checks `Host` and `Origin` of a request that arrived at `local_ip`, and returns the host with its port.
@@ -70,16 +64,6 @@ impl Access {
             }
         }
     }
-
-    /// Checks the parameter `token` of a URL.
-    pub(super) fn check_token(&self, uri: &Uri) -> Result<(), Denied> {
-        let mut parameters = uri.query().unwrap_or_default().split('&');
-        let token = parameters.find_map(|parameter| parameter.strip_prefix("token="));
-        match token.is_some_and(|token| is_equal(token.as_bytes(), self.token.as_str().as_bytes())) {
-            true => Ok(()),
-            false => Err(Denied::Token),
-        }
-    }
 }
 
 /// The text of a header that occurs once.
@@ -89,18 +73,12 @@ fn single_header(headers: &HeaderMap, name: header::HeaderName) -> Option<&str> 
     value.to_str().ok().filter(|_| values.next().is_none())
 }
 
-/// Compares two texts in a time that does not depend on the position of the first difference.
-fn is_equal(a: &[u8], b: &[u8]) -> bool {
-    let difference = a.iter().zip(b).fold(0, |difference, (a, b)| black_box(difference | (a ^ b)));
-    a.len() == b.len() && difference == 0
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn access() -> Access {
-        Access::new("0123456789abcdef".parse().expect("expected a token"), Some("renderer".into()))
+        Access::new(Some("renderer".into()))
     }
 
     fn headers(list: &[(header::HeaderName, &str)]) -> HeaderMap {
@@ -145,7 +123,7 @@ mod tests {
             assert_eq!(check(&[(header::HOST, host)]), Err(Denied::Host), "{host}");
         }
         assert_eq!(check(&[]), Err(Denied::Host));
-        let local = Access::new("0123456789abcdef".parse().expect("expected a token"), None);
+        let local = Access::new(None);
         let name = headers(&[(header::HOST, "renderer")]);
         assert_eq!(local.check_site(&name, None), Err(Denied::Host));
     }
@@ -178,23 +156,5 @@ mod tests {
             headers.append(header::ORIGIN, "http://localhost".parse().expect("expected a header"));
         }
         assert_eq!(access().check_site(&headers, None), Err(Denied::Origin));
-    }
-
-    #[test]
-    fn token_is_compared_completely() {
-        let check = |uri: &str| access().check_token(&uri.parse().expect("expected a URI"));
-        assert_eq!(check("/?token=0123456789abcdef"), Ok(()));
-        assert_eq!(check("/?a=b&token=0123456789abcdef"), Ok(()));
-        for uri in [
-            "/",
-            "/?token=",
-            "/?token=0123456789abcde",
-            "/?token=0123456789abcdef0",
-            "/?token=1123456789abcdef",
-            "/?token=0123456789ABCDEF",
-            "/?xtoken=0123456789abcdef",
-        ] {
-            assert_eq!(check(uri), Err(Denied::Token), "{uri}");
-        }
     }
 }

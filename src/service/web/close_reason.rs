@@ -55,6 +55,10 @@ impl CloseReason {
         Self::new(4001, format!("expected {expected}, got {given}"))
     }
 
+    pub(super) fn unknown_session() -> Self {
+        Self::new(4003, "expected the token of a session of this server")
+    }
+
     pub(super) fn over_credit() -> Self {
         Self::new(4002, "expected credit for a message, got none")
     }

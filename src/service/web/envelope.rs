@@ -17,6 +17,7 @@ const END: u8 = 2;
 const CANCEL: u8 = 3;
 const CREDIT: u8 = 4;
 const STATUS: u8 = 5;
+const SESSION: u8 = 6;
 
 /// A message of the client.
 #[derive(Debug, PartialEq, Eq)]
@@ -35,6 +36,8 @@ pub(super) enum ClientContent {
     Cancel,
     /// Bytes of messages that the client has processed.
     Credit(u32),
+    /// The token of a viewer session.
+    Session(String),
 }
 
 /// The content of a START message.
@@ -60,12 +63,19 @@ impl ClientMessage {
             END if bytes.is_empty() => ClientContent::End,
             CANCEL if bytes.is_empty() => ClientContent::Cancel,
             CREDIT if bytes.len() == 4 => ClientContent::Credit(bytes.get_u32_le()),
+            SESSION if id == 0 => ClientContent::Session(parse_session(&bytes)?),
+            SESSION => return Err(CloseReason::malformed("SESSION with the id 0", id)),
             END | CANCEL => return Err(CloseReason::malformed("END or CANCEL without payload", bytes.len())),
             CREDIT => return Err(CloseReason::malformed("CREDIT with 4 bytes", bytes.len())),
-            _ => return Err(CloseReason::malformed("kind 0 to 4", kind)),
+            _ => return Err(CloseReason::malformed("kind 0 to 4 or 6", kind)),
         };
         Ok(Self { id, content })
     }
+}
+
+fn parse_session(bytes: &[u8]) -> Result<String, CloseReason> {
+    let text = std::str::from_utf8(bytes).map_err(|_| CloseReason::malformed("SESSION with a text", "other bytes"))?;
+    Ok(text.to_owned())
 }
 
 impl CallHead {
@@ -125,6 +135,15 @@ mod tests {
             (&[0, 1, 0, 0], CREDIT, ClientContent::Credit(256)),
         ] {
             assert_eq!(parse(&[&[7, 0, 0, 0, kind], payload].concat()), Ok(ClientMessage { id: 7, content }));
+        }
+    }
+
+    #[test]
+    fn session_belongs_to_no_call() {
+        let content = ClientContent::Session("ab".into());
+        assert_eq!(parse(b"\0\0\0\0\x06ab"), Ok(ClientMessage { id: 0, content }));
+        for bytes in [&b"\x01\0\0\0\x06ab"[..], b"\0\0\0\0\x06\xff"] {
+            assert_eq!(parse(bytes).expect_err("expected a malformed message").code(), 4000);
         }
     }
 

@@ -19,7 +19,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
-use http_body_util::Full;
+use http_body_util::{BodyExt as _, Collected, Full, Limited};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::upgrade::OnUpgrade;
@@ -33,6 +33,7 @@ pub(super) use self::access::Access;
 use self::access::Denied;
 use self::page::Page;
 use self::websocket::{WebSocketLimits, serve_websocket};
+use super::authentication::{Authenticator, WRONG_TOKEN_DELAY, bearer_token};
 use super::connection::ConnectionInfo;
 use super::connection_table::ConnectionSlot;
 use super::listen::Socket;
@@ -49,6 +50,9 @@ const SUBPROTOCOL: &str = "modalcast.v1";
 const MAX_HEAD_BYTES: usize = 16 << 10;
 const MAX_HEADERS: usize = 64;
 
+/// Limit on the body of a request for a session.
+const MAX_CODE_BYTES: usize = 512;
+
 /// Time within which a client must send its request and take the answer.
 const EXCHANGE_TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -56,7 +60,9 @@ const EXCHANGE_TIMEOUT: Duration = Duration::from_secs(60);
 pub(super) struct WebServer {
     routes: Routes,
     access: Access,
+    authenticator: Arc<Authenticator>,
     page: Page,
+    recording: Option<Bytes>,
     /// Whether the server is healthy.
     is_serving: Arc<AtomicBool>,
     http1: http1::Builder,
@@ -70,11 +76,17 @@ type Answer = Response<Full<Bytes>>;
 type Upgrade = Mutex<Option<OnUpgrade>>;
 
 impl WebServer {
-    /// Unpacks the page of the viewer, and adds the recording of the configuration.
+    /// Unpacks the page of the viewer.
     ///
     /// # Errors
     /// `Fault` when the page that the program contains is damaged.
-    pub(super) fn new(routes: Routes, access: Access, is_serving: Arc<AtomicBool>, config: &Config) -> Result<Self> {
+    pub(super) fn new(
+        routes: Routes,
+        access: Access,
+        authenticator: &Arc<Authenticator>,
+        is_serving: Arc<AtomicBool>,
+        config: &Config,
+    ) -> Result<Self> {
         let mut http1 = http1::Builder::new();
         http1
             .timer(TokioTimer::new())
@@ -84,25 +96,35 @@ impl WebServer {
             .max_buf_size(MAX_HEAD_BYTES);
         let websocket_limits = WebSocketLimits::new(config);
         let page = config.viewer_recording.as_ref().map_or_else(Page::viewer, Page::playing)?;
-        Ok(Self { routes, access, page, is_serving, http1, websocket_limits })
+        let recording = config.viewer_recording.as_ref().map(|recording| recording.file.clone());
+        let authenticator = Arc::clone(authenticator);
+        Ok(Self { routes, access, authenticator, page, recording, is_serving, http1, websocket_limits })
     }
 
     /// Serves a connection, of which `first_bytes` were read before, until it ends or must be closed.
     pub(super) async fn serve(&self, socket: Socket, first_bytes: Bytes, info: ConnectionInfo, slot: &ConnectionSlot) {
-        let Some(on_upgrade) = self.serve_request(socket, first_bytes, slot).await else { return };
+        let on_upgrade = self.serve_request(socket, first_bytes, &info, slot).await;
+        let Some(on_upgrade) = on_upgrade else { return };
         let Ok(upgraded) = on_upgrade.await else { return };
         let Ok(parts) = upgraded.downcast::<TokioIo<MeteredSocket<Socket, ()>>>() else { return };
         let socket = parts.io.into_inner().socket;
-        serve_websocket(socket, parts.read_buf, self.routes.clone(), info, slot, self.websocket_limits).await;
+        let (routes, sessions) = (self.routes.clone(), Arc::clone(self.authenticator.directory()));
+        serve_websocket(socket, parts.read_buf, routes, sessions, info, slot, self.websocket_limits).await;
     }
 
     /// Answers one request. Returns the upgrade if it was the handshake of a WebSocket.
-    async fn serve_request(&self, socket: Socket, first_bytes: Bytes, slot: &ConnectionSlot) -> Option<OnUpgrade> {
+    async fn serve_request(
+        &self,
+        socket: Socket,
+        first_bytes: Bytes,
+        info: &ConnectionInfo,
+        slot: &ConnectionSlot,
+    ) -> Option<OnUpgrade> {
         let local_ip = socket.local_ip();
         let upgrade = Upgrade::default();
         let service = hyper::service::service_fn(|request| {
-            let answer = self.answer(request, local_ip, &upgrade);
-            async { Ok::<_, Infallible>(answer) }
+            let answer = self.answer(request, info, local_ip, &upgrade);
+            async { Ok::<_, Infallible>(answer.await) }
         });
         let io = TokioIo::new(MeteredSocket::new(socket, first_bytes, ()));
         let connection = self.http1.serve_connection(io, service).with_upgrades();
@@ -118,37 +140,69 @@ impl WebServer {
     }
 
     /// Answers a request. Sets `upgrade` if the answer begins a WebSocket.
-    fn answer(&self, request: Request<Incoming>, local_ip: Option<IpAddr>, upgrade: &Upgrade) -> Answer {
+    async fn answer(
+        &self,
+        request: Request<Incoming>,
+        info: &ConnectionInfo,
+        local_ip: Option<IpAddr>,
+        upgrade: &Upgrade,
+    ) -> Answer {
         let host = match self.access.check_site(request.headers(), local_ip) {
             Ok(host) => host,
             Err(denied) => return denied_answer(denied),
         };
-        let is_page = match request.uri().path() {
-            "/" => true,
-            "/websocket" => false,
-            "/healthz" if request.method() == Method::GET => return self.health_answer(),
-            "/healthz" => return method_answer(),
-            _ => return text_answer(StatusCode::NOT_FOUND, "expected the path /, /websocket or /healthz\n"),
-        };
-        if request.method() != Method::GET {
-            return method_answer();
-        }
-        if let Err(denied) = self.access.check_token(request.uri()) {
-            return denied_answer(denied);
-        }
-        if is_page {
-            return self.page_answer(host);
-        }
-        match websocket_accept_key(request.headers()) {
-            Some(key) => {
-                *lock(upgrade) = Some(hyper::upgrade::on(request));
-                websocket_answer(&key)
-            }
-            None => text_answer(
-                StatusCode::BAD_REQUEST,
-                format!("expected the handshake of a WebSocket with version 13 and the subprotocol {SUBPROTOCOL}\n"),
+        match (request.uri().path(), request.method()) {
+            ("/", &Method::GET) => self.page_answer(host),
+            ("/healthz", &Method::GET) => self.health_answer(),
+            ("/recording", &Method::GET) => self.recording_answer(request.headers(), info).await,
+            ("/session", &Method::POST) => self.session_answer(request.into_body()).await,
+            ("/websocket", &Method::GET) => match websocket_accept_key(request.headers()) {
+                Some(key) => {
+                    *lock(upgrade) = Some(hyper::upgrade::on(request));
+                    websocket_answer(&key)
+                }
+                None => text_answer(
+                    StatusCode::BAD_REQUEST,
+                    format!(
+                        "expected the handshake of a WebSocket with version 13 and the subprotocol {SUBPROTOCOL}\n"
+                    ),
+                ),
+            },
+            ("/session", _) => method_answer("POST"),
+            ("/" | "/healthz" | "/recording" | "/websocket", _) => method_answer("GET"),
+            _ => text_answer(
+                StatusCode::NOT_FOUND,
+                "expected the path /, /healthz, /recording, /session or /websocket\n",
             ),
         }
+    }
+
+    /// Exchanges the code of a link, which is the body, for the token of a session.
+    async fn session_answer(&self, body: Incoming) -> Answer {
+        let code = Limited::new(body, MAX_CODE_BYTES).collect().await.map(Collected::to_bytes).unwrap_or_default();
+        let sessions = self.authenticator.directory().viewer_sessions();
+        match sessions.redeem(&String::from_utf8_lossy(&code)) {
+            Ok(Some(session)) => text_answer(StatusCode::OK, session),
+            Ok(None) => {
+                tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+                text_answer(StatusCode::FORBIDDEN, "expected the code of a link that is not used yet\n")
+            }
+            Err(error) => text_answer(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
+        }
+    }
+
+    /// The recording that the page plays, for the bearer of a session.
+    async fn recording_answer(&self, headers: &HeaderMap, info: &ConnectionInfo) -> Answer {
+        let Some(recording) = &self.recording else {
+            return text_answer(StatusCode::NOT_FOUND, "this server has no recording\n");
+        };
+        let session = bearer_token(headers);
+        let is_known = |session| self.authenticator.directory().viewer_sessions().find(session).is_some();
+        if info.credential.is_none() && !session.is_some_and(is_known) {
+            tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+            return text_answer(StatusCode::FORBIDDEN, "expected the token of a session of this server\n");
+        }
+        answer_with(StatusCode::OK, "application/octet-stream", recording.clone())
     }
 
     fn health_answer(&self) -> Answer {
@@ -165,7 +219,7 @@ impl WebServer {
             headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
         }
         // The host was parsed before, so it is a valid header value.
-        if let Ok(policy) = HeaderValue::try_from(self.page.policy(host)) {
+        if let Ok(policy) = HeaderValue::try_from(self.page.policy(host, self.authenticator.authentication())) {
             headers.insert(header::CONTENT_SECURITY_POLICY, policy);
         }
         answer
@@ -202,15 +256,13 @@ fn websocket_answer(accept_key: &str) -> Answer {
 
 fn denied_answer(denied: Denied) -> Answer {
     let expected = denied.expected();
-    let text = format!(
-        "Expected {expected}.\n\nOpen the URL that `modalcast serve` prints as 'viewer at'. The token is new at each start.\n"
-    );
+    let text = format!("Expected {expected}.\n\nOpen the URL that `modalcast serve` prints as 'viewer at'.\n");
     text_answer(StatusCode::FORBIDDEN, text)
 }
 
-fn method_answer() -> Answer {
-    let mut answer = text_answer(StatusCode::METHOD_NOT_ALLOWED, "expected the method GET\n");
-    answer.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET"));
+fn method_answer(method: &'static str) -> Answer {
+    let mut answer = text_answer(StatusCode::METHOD_NOT_ALLOWED, format!("expected the method {method}\n"));
+    answer.headers_mut().insert(header::ALLOW, HeaderValue::from_static(method));
     answer
 }
 

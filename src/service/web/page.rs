@@ -8,7 +8,7 @@ use base64::engine::general_purpose::STANDARD;
 use bytes::Bytes;
 use sha2::{Digest as _, Sha256};
 
-use crate::config::ViewerRecording;
+use crate::config::{Authentication, ViewerRecording};
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// The viewer: one HTML file with all scripts and styles, compressed with gzip. `clients/web` builds it.
@@ -40,34 +40,35 @@ impl Page {
         Ok(Self { body: Bytes::from_static(VIEWER), is_compressed: true, script_sources })
     }
 
-    /// The viewer with a recording inside, which it plays without a connection to the server.
+    /// The viewer, which plays the recording of this server. The recording is not in the page, because the page is public.
     ///
     /// # Errors
     /// As for [`Self::viewer`].
     pub(super) fn playing(recording: &ViewerRecording) -> Result<Self> {
-        let ViewerRecording { file, slow } = recording;
         let html = viewer_html()?;
         let (start, end) =
             html.split_once(RECORDING_PLACE).ok_or_else(|| fault("viewer page", "expected a place for a recording"))?;
-        let text_bytes = base64::encoded_len(file.len(), true).unwrap_or_default();
-        let mut body = String::with_capacity(html.len() + text_bytes + 128);
-        body.push_str(start);
-        write!(body, "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"{slow}\">")
-            .map_err(fault_in("viewer page"))?;
-        STANDARD.encode_string(file, &mut body);
-        body.push_str("</script>");
-        body.push_str(end);
+        let slow = recording.slow;
         // A script of this type is data, which the policy does not concern.
+        let element = format!(
+            "<script id=\"recording\" type=\"text/plain\" data-path=\"recording\" data-slow=\"{slow}\"></script>"
+        );
+        let body = [start, &element, end].concat();
         Ok(Self { body: body.into(), is_compressed: false, script_sources: script_sources(&html)? })
     }
 
     /// The content security policy for a page that was loaded from `host`, which may have a port. Only the scripts of
-    /// the page may run, and only this server may be connected to. Pages that embed the viewer, such as notebooks, are
-    /// allowed, because they need the token.
-    pub(super) fn policy(&self, host: &str) -> String {
+    /// the page may run, and only this server may be connected to. Any page may embed the viewer, as notebooks do: a frame
+    /// has no session until its own link gives it one. A server without authentication needs no session, so only pages of
+    /// this machine may embed its viewer.
+    pub(super) fn policy(&self, host: &str, authentication: Authentication) -> String {
+        let ancestors = match authentication {
+            Authentication::Off => "; frame-ancestors 'self' http://localhost:* http://127.0.0.1:*",
+            Authentication::UsersAndTokens | Authentication::Tokens => "",
+        };
         format!(
             "default-src 'none'; script-src{}; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; \
-             worker-src blob:; connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'",
+             worker-src blob:; connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'{ancestors}",
             self.script_sources
         )
     }
@@ -122,20 +123,24 @@ mod tests {
     fn viewer_is_intact() {
         let page = Page::viewer().expect("expected the viewer");
         assert!(page.body.starts_with(&[0x1f, 0x8b]));
-        let policy = page.policy("localhost:8000");
+        let policy = page.policy("localhost:8000", Authentication::UsersAndTokens);
         assert!(policy.contains("connect-src 'self' ws://localhost:8000;"), "{policy}");
-        assert!(!policy.contains("script-src 'unsafe"), "{policy}");
+        assert!(!policy.contains("script-src 'unsafe") && !policy.contains("frame-ancestors"), "{policy}");
+        let policy = page.policy("localhost:8000", Authentication::Off);
+        assert!(policy.contains("frame-ancestors 'self' http://localhost:*"), "{policy}");
     }
 
     #[test]
-    fn recording_is_inside_of_the_page_under_the_same_policy() {
+    fn recording_is_named_by_the_page_under_the_same_policy() {
         let viewer = Page::viewer().expect("expected the viewer");
         let recording = ViewerRecording { file: Bytes::from_static(b"\x89MCAP"), slow: 100.0 };
         let page = Page::playing(&recording).expect("expected a page");
         let html = std::str::from_utf8(&page.body).expect("expected text");
-        let element = "<script id=\"recording\" type=\"application/octet-stream\" data-slow=\"100\">iU1DQVA=</script>";
+        let element =
+            "<script id=\"recording\" type=\"text/plain\" data-path=\"recording\" data-slow=\"100\"></script>";
         assert_eq!(html.replace(element, RECORDING_PLACE), viewer_html().expect("expected the viewer"));
         assert!(!page.is_compressed && viewer.is_compressed);
-        assert_eq!(page.policy("localhost"), viewer.policy("localhost"));
+        let policy = |page: &Page| page.policy("localhost", Authentication::Tokens);
+        assert_eq!(policy(&page), policy(&viewer));
     }
 }

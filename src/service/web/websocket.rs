@@ -14,6 +14,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
+use super::super::authentication::WRONG_TOKEN_DELAY;
 use super::super::connection::ConnectionInfo;
 use super::super::connection_table::{ConnectionSlot, GOAWAY_TIMEOUT};
 use super::super::listen::Socket;
@@ -27,6 +28,7 @@ use super::envelope::{CallHead, ClientContent, ClientMessage, ENVELOPE_BYTES};
 use super::frame_meter::{FrameMeter, Traffic};
 use super::outgoing::{Outgoing, write_messages};
 use crate::config::Config;
+use crate::identity::Directory;
 use modalcast_model::error::Error;
 
 /// Limit on the open calls of one connection.
@@ -119,6 +121,7 @@ pub(super) async fn serve_websocket(
     socket: Socket,
     first_bytes: Bytes,
     routes: Routes,
+    sessions: Arc<Directory>,
     info: ConnectionInfo,
     slot: &ConnectionSlot,
     limits: WebSocketLimits,
@@ -137,7 +140,7 @@ pub(super) async fn serve_websocket(
     let mut writer = new_stream(write_socket, limits.library_settings()).await;
     let (outgoing, mut queue) = mpsc::channel(OUTGOING_CAPACITY);
     let keep_alive = keep_alive(&traffic, outgoing.clone(), limits);
-    let calls = Calls::new(routes, info, outgoing);
+    let calls = Calls::new(routes, sessions, info, outgoing);
     let reason = {
         let mut write = std::pin::pin!(write_messages(&mut writer, &mut queue, &traffic.sent));
         let reason = tokio::select! {
@@ -200,6 +203,7 @@ struct OpenCall {
 /// The calls of a connection. Dropping them cancels them.
 struct Calls {
     routes: Routes,
+    sessions: Arc<Directory>,
     info: ConnectionInfo,
     outgoing: mpsc::Sender<Outgoing>,
     /// Calls whose status is not queued yet, and ended calls that are not removed yet.
@@ -213,9 +217,10 @@ struct Calls {
 }
 
 impl Calls {
-    fn new(routes: Routes, info: ConnectionInfo, outgoing: mpsc::Sender<Outgoing>) -> Self {
+    fn new(routes: Routes, sessions: Arc<Directory>, info: ConnectionInfo, outgoing: mpsc::Sender<Outgoing>) -> Self {
         Self {
             routes,
+            sessions,
             info,
             outgoing,
             open: HashMap::new(),
@@ -269,8 +274,10 @@ impl Calls {
             Message::Pong(_) | Message::Frame(_) => return Ok(()),
         };
         let id = message.id;
-        if let ClientContent::Start(head) = message.content {
-            return self.start(id, head).await;
+        match message.content {
+            ClientContent::Start(head) => return self.start(id, head).await,
+            ClientContent::Session(token) => return self.set_session(&token).await,
+            _ => {}
         }
         if self.last_id.is_none_or(|last_id| id > last_id) {
             return Err(CloseReason::invalid_id("the id of a START", id));
@@ -278,7 +285,7 @@ impl Calls {
         // Messages of calls that have ended are ignored.
         let Some(call) = self.open.get(&id) else { return Ok(()) };
         match message.content {
-            ClientContent::Start(_) => {}
+            ClientContent::Start(_) | ClientContent::Session(_) => {}
             ClientContent::Message(message) => call.messages.push(message)?,
             ClientContent::End => call.messages.complete(),
             ClientContent::Credit(bytes) => call.credit.add(bytes),
@@ -287,6 +294,16 @@ impl Calls {
                 self.open.remove(&id);
             }
         }
+        Ok(())
+    }
+
+    /// Gives later calls the rights of a session.
+    async fn set_session(&mut self, token: &str) -> Result<(), CloseReason> {
+        let Some(credential) = self.sessions.viewer_sessions().find(token) else {
+            tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+            return Err(CloseReason::unknown_session());
+        };
+        self.info.credential = Some(credential);
         Ok(())
     }
 

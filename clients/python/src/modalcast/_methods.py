@@ -40,6 +40,9 @@ def _method(path: str, request: type[RequestT], reply: type[ReplyT]) -> Method[R
 GET_SERVER_INFO = _method(
     "ServerService/GetServerInfo", server_pb2.GetServerInfoRequest, server_pb2.GetServerInfoResponse
 )
+CREATE_VIEWER_LINK = _method(
+    "ServerService/CreateViewerLink", server_pb2.CreateViewerLinkRequest, server_pb2.CreateViewerLinkResponse
+)
 OPEN_SCENE = _method("SceneService/OpenScene", scenes_pb2.OpenSceneRequest, scenes_pb2.OpenSceneResponse)
 UPLOAD_SCENE = _method("SceneService/UploadScene", scenes_pb2.UploadSceneRequest, scenes_pb2.UploadSceneResponse)
 UPLOAD_ARRAYS = _method("SceneService/UploadArrays", scenes_pb2.UploadArraysRequest, scenes_pb2.UploadArraysResponse)
@@ -48,6 +51,7 @@ FIND_UPLOADED_FILES = _method(
 )
 LIST_SCENES = _method("SceneService/ListScenes", scenes_pb2.ListScenesRequest, scenes_pb2.ListScenesResponse)
 DELETE_SCENE = _method("SceneService/DeleteScene", scenes_pb2.DeleteSceneRequest, scenes_pb2.DeleteSceneResponse)
+SHARE_SCENE = _method("SceneService/ShareScene", scenes_pb2.ShareSceneRequest, scenes_pb2.ShareSceneResponse)
 DESCRIBE_SCENE = _method(
     "SceneService/DescribeScene", scenes_pb2.DescribeSceneRequest, scenes_pb2.DescribeSceneResponse
 )

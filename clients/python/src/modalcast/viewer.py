@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import html
+import json
+import os
+import tempfile
 import webbrowser
 from dataclasses import dataclass
+from pathlib import Path
 from urllib.parse import quote
 
 from modalcast._channel import target_of
@@ -16,7 +20,8 @@ class ViewerLink:
     """The viewer of a scene. A notebook shows the viewer itself.
 
     Attributes:
-        url: The URL, with the token of the server. Anyone who has it can use the server through this host and port.
+        url: The URL, with a code that is valid once: the first page that opens it gets the rights of this client.
+            Another `Scene.view` makes another link.
         height: Height in a notebook, in pixels.
     """
 
@@ -25,7 +30,13 @@ class ViewerLink:
 
     def open(self) -> bool:
         """Opens the viewer in a browser of this machine. Returns whether there is one."""
-        return webbrowser.open(self.url)
+        # Other users can read the arguments of a process, so the browser gets a private file that leads to the URL.
+        folder = os.environ.get("XDG_RUNTIME_DIR") or None
+        with tempfile.NamedTemporaryFile("w", dir=folder, prefix="modalcast-", suffix=".html", delete=False) as file:
+            file.write(
+                f"<!doctype html><title>modalcast</title><script>location.replace({json.dumps(self.url)})</script>"
+            )
+        return webbrowser.open(Path(file.name).as_uri())
 
     def __str__(self) -> str:
         return self.url
@@ -40,11 +51,10 @@ def viewer_link(address: str, url_path: str, scene: str, height: int) -> ViewerL
     """The viewer of a scene on the server at an address of a client.
 
     Raises:
-        Unavailable: The viewer of the server is off, or the address is a Unix socket, which browsers cannot use.
+        Unavailable: The address is a Unix socket, which browsers cannot use.
     """
     target = target_of(address)
     if target.startswith("unix:"):
         raise Unavailable(f"{address}: expected an address HOST:PORT, which browsers can use, got a Unix socket")
-    if not url_path:
-        raise Unavailable(f"{address}: the viewer of this server is off (`modalcast serve --no-viewer`)")
-    return ViewerLink(f"http://{target}{url_path}#scene={quote(scene)}", height)
+    separator = "&" if "#" in url_path else "#"
+    return ViewerLink(f"http://{target}{url_path}{separator}scene={quote(scene)}", height)

@@ -78,6 +78,14 @@ impl FakeService {
 
 #[tonic::async_trait]
 impl ServerService for FakeService {
+    async fn create_viewer_link(
+        &self,
+        request: Request<v1::CreateViewerLinkRequest>,
+    ) -> Result<Response<v1::CreateViewerLinkResponse>, Status> {
+        let url_path = format!("/#code={}", request.into_inner().principal);
+        Ok(Response::new(v1::CreateViewerLinkResponse { url_path }))
+    }
+
     async fn get_server_info(
         &self,
         _: Request<v1::GetServerInfoRequest>,

@@ -44,20 +44,34 @@ export interface DuplexStream<I, O> extends ReplyStream<O> {
 export class Channel {
     private readonly calls = new Map<number, Call>();
     private nextCall = 1;
+    /** Why the server has closed the connection; 0 while it is open. */
+    closeCode = 0;
     bytesReceived = 0;
     bytesSent = 0;
 
     private constructor(private readonly socket: WebSocket) {
         socket.addEventListener("message", (event) => this.onMessage(event));
-        socket.addEventListener("close", () => this.fail());
+        socket.addEventListener("close", (event) => {
+            this.closeCode = event.code;
+            this.fail();
+        });
     }
 
-    /** Opens a connection. Rejects if the server cannot be reached or refuses the connection. */
-    static open(url: string): Promise<Channel> {
+    /**
+     * Opens a connection. Rejects if the server cannot be reached or refuses the connection.
+     *
+     * @param session Token of the session whose rights the calls have; null: none.
+     */
+    static open(url: string, session: string | null = null): Promise<Channel> {
         return new Promise((resolve, reject) => {
             const socket = new WebSocket(url, SUBPROTOCOL);
             socket.binaryType = "arraybuffer";
-            socket.addEventListener("open", () => resolve(new Channel(socket)), { once: true });
+            const start = () => {
+                const channel = new Channel(socket);
+                if (session) channel.send(0, ClientKind.session, new TextEncoder().encode(session));
+                resolve(channel);
+            };
+            socket.addEventListener("open", start, { once: true });
             socket.addEventListener("error", () => reject(unavailable()), { once: true });
         });
     }

@@ -1,7 +1,7 @@
 /** Messages of the WebSocket envelope, see `proto/websocket.md`: call id (u32), kind (u8), payload; little-endian. */
 
 /** Kinds of messages from the client. */
-export const ClientKind = { start: 0, message: 1, end: 2, cancel: 3, credit: 4 } as const;
+export const ClientKind = { start: 0, message: 1, end: 2, cancel: 3, credit: 4, session: 6 } as const;
 /** Kinds of messages from the server. */
 export const ServerKind = { message: 1, credit: 4, status: 5 } as const;
 

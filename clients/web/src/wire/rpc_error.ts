@@ -3,7 +3,15 @@
 import { BinaryReader, WireType } from "@bufbuild/protobuf/wire";
 
 /** Status codes of gRPC that the viewer distinguishes. */
-export const StatusCode = { ok: 0, cancelled: 1, unknown: 2, notFound: 5, unimplemented: 12, unavailable: 14 } as const;
+export const StatusCode = {
+    ok: 0,
+    cancelled: 1,
+    unknown: 2,
+    notFound: 5,
+    unimplemented: 12,
+    unavailable: 14,
+    unauthenticated: 16,
+} as const;
 
 const ERROR_INFO = "type.googleapis.com/google.rpc.ErrorInfo";
 

@@ -24,7 +24,6 @@ declare global {
 const TIMEOUT_MS = 120_000;
 /** Whether servers show the page of dist instead of the one that they were built with. */
 export const usesCommittedPage = Boolean(process.env["MODALCAST_COMMITTED_PAGE"]);
-const TOKEN = "smoke-test-token-0001";
 const programs = resolve(process.env["MODALCAST_PROGRAMS"] ?? join(process.cwd(), "../../target/debug"));
 
 /** The page of this folder. The programs have that of their build. */
@@ -49,15 +48,19 @@ export class ServerProcess {
     private process: ChildProcess | null = null;
     private readonly state = temporaryFolder();
     private port = 0;
+    /** The link that the server has printed at its last start. */
+    link = "";
     private connected: Server | null = null;
 
     /**
      * @param scenes Folder of the scene repository; empty: built-in scenes only.
      * @param options More options of `modalcast serve`.
+     * @param needsSession Whether pages need a link with a code. Otherwise the server identifies nobody.
      */
     constructor(
         private readonly scenes = "",
         private readonly options: readonly string[] = [],
+        private readonly needsSession = false,
     ) {}
 
     /** Starts the server, the second time at the same port. */
@@ -68,8 +71,7 @@ export class ServerProcess {
             "serve",
             "--listen",
             listen,
-            "--viewer-token",
-            TOKEN,
+            ...(this.needsSession ? [] : ["--no-auth"]),
             "--state",
             this.state,
             "--backend",
@@ -78,12 +80,13 @@ export class ServerProcess {
             ...this.options,
         ];
         this.process = startProgram("modalcast", options, ["ignore", "pipe", "pipe"]);
-        this.port = Number(new URL(await printedUrl(this.process, "viewer at")).port);
+        this.link = await printedUrl(this.process, "viewer at");
+        this.port = Number(new URL(this.link).port);
     }
 
     /** The page with a scene. */
     pageUrl(scene: string, parameters = ""): string {
-        return `http://127.0.0.1:${this.port}/?token=${TOKEN}#scene=${scene}${parameters}`;
+        return `http://127.0.0.1:${this.port}/#scene=${scene}${parameters}`;
     }
 
     get grpcUrl(): string {
@@ -92,7 +95,7 @@ export class ServerProcess {
 
     /** A new client in this process. */
     async connect(): Promise<Server> {
-        const channel = await Channel.open(`ws://127.0.0.1:${this.port}/websocket?token=${TOKEN}`);
+        const channel = await Channel.open(`ws://127.0.0.1:${this.port}/websocket`);
         return new Server(channel, await ContentCache.open());
     }
 
@@ -118,9 +121,13 @@ export class ServerProcess {
     }
 }
 
+export function programPath(name: string): string {
+    return join(programs, name);
+}
+
 /** Starts a program of the project. It ends with this process at the latest. */
 export function startProgram(name: string, options: string[], stdio: StdioOptions = "ignore"): ChildProcess {
-    const program = spawn(join(programs, name), options, { stdio });
+    const program = spawn(programPath(name), options, { stdio });
     const kill = () => program.kill("SIGKILL");
     process.once("exit", kill);
     program.once("exit", () => process.removeListener("exit", kill));

@@ -22,11 +22,13 @@ from modalcast._decoders import (
 )
 from modalcast._methods import (
     APPLY_FORCES,
+    CREATE_VIEWER_LINK,
     GET_STATE,
     GET_VERTICES,
     PICK,
     RENDER_FRAME,
     RESET_SCENE,
+    SHARE_SCENE,
     STREAM_FORCES,
     STREAM_FRAMES,
     STREAM_STATES,
@@ -110,6 +112,16 @@ class Scene:
         return self.info.coordinates
 
     @property
+    def owner(self) -> str:
+        """The principal that the scene belongs to: "owner" for the user who has started the server."""
+        return self.info.owner
+
+    @property
+    def shared_with(self) -> tuple[str, ...]:
+        """The principals with whom the scene is shared, or `("*",)` for all."""
+        return tuple(self.info.shared_with)
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """Warnings of the loader, for example about missing images and an implausible size. Empty for most scenes."""
         return tuple(self.info.remarks)
@@ -118,19 +130,25 @@ class Scene:
         counts = f"{len(self.domains)} domains, {self.vertex_count} vertices, {self.coordinate_count} coordinates"
         return f"<Scene '{self.name}': {counts}>"
 
-    def view(self, *, height: int = 600) -> ViewerLink:
+    async def view(self, *, height: int = 600, timeout: float | None = None) -> ViewerLink:
         """The browser viewer of this scene, which a notebook shows. `ViewerLink.open` opens it in a browser.
 
         The browser must reach the server at the address of this client. Through SSH, forward the port:
         `ssh -L PORT:127.0.0.1:PORT HOST`.
 
+        Each link is valid once: call `view` again to show the viewer another time.
+
         Args:
             height: Height in a notebook, in pixels.
+            timeout: In seconds; None: that of the client.
 
         Raises:
             Unavailable: The viewer of the server is off, or the client uses a Unix socket.
+            Error: The call failed.
         """
-        return viewer_link(self.client.address, self.client.info.viewer_url_path, self.name, height)
+        request = server_pb2.CreateViewerLinkRequest()
+        reply = await self._transport.unary(CREATE_VIEWER_LINK, request, self._time_limit(timeout))
+        return viewer_link(self.client.address, reply.url_path, self.name, height)
 
     async def describe(
         self,
@@ -658,6 +676,25 @@ class Scene:
             0,
             "latest",
         )
+
+    async def share(self, *principals: str, timeout: float | None = None) -> None:
+        """Shares the scene with other principals of the server, in place of those with whom it was shared.
+
+        Others than its owner do not see a scene that is not shared. Those with whom it is shared may do what their
+        roles permit, except delete, reset and share the scene, replace its writer, and receive lossless streams.
+
+        Args:
+            principals: Names of principals, or "*" for all. Without names, the scene is no longer shared, and the
+                streams of others end.
+
+        Raises:
+            PermissionDenied: The scene belongs to another principal.
+            InvalidRequest: A name is malformed.
+            Error: The call failed.
+        """
+        request = scenes_pb2.ShareSceneRequest(scene=self.name, principals=principals)
+        reply = await self._transport.unary(SHARE_SCENE, request, self._time_limit(timeout))
+        self.info.shared_with[:] = reply.shared_with
 
     async def delete(self, *, timeout: float | None = None) -> None:
         """Closes the scene for all clients, and removes the files of an uploaded scene.

@@ -65,7 +65,7 @@ class OpenSceneResponse(_message.Message):
     def __init__(self, scene: _Optional[_Union[SceneInfo, _Mapping]] = ...) -> None: ...
 
 class SceneInfo(_message.Message):
-    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting", "durable_step")
+    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting", "durable_step", "owner", "shared_with")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     DOMAINS_FIELD_NUMBER: _ClassVar[int]
@@ -82,6 +82,8 @@ class SceneInfo(_message.Message):
     REMARKS_FIELD_NUMBER: _ClassVar[int]
     LIGHTING_FIELD_NUMBER: _ClassVar[int]
     DURABLE_STEP_FIELD_NUMBER: _ClassVar[int]
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    SHARED_WITH_FIELD_NUMBER: _ClassVar[int]
     scene: str
     source: str
     domains: int
@@ -98,7 +100,9 @@ class SceneInfo(_message.Message):
     remarks: _containers.RepeatedScalarFieldContainer[str]
     lighting: Lighting
     durable_step: _common_pb2.StepId
-    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ...) -> None: ...
+    owner: str
+    shared_with: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., owner: _Optional[str] = ..., shared_with: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class Lighting(_message.Message):
     __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping", "ambient_cube", "fill", "ambient_occlusion_radius")
@@ -271,6 +275,22 @@ class DeleteSceneRequest(_message.Message):
 class DeleteSceneResponse(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
+
+class ShareSceneRequest(_message.Message):
+    __slots__ = ("scene", "principals")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    PRINCIPALS_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    principals: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, scene: _Optional[str] = ..., principals: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class ShareSceneResponse(_message.Message):
+    __slots__ = ("owner", "shared_with")
+    OWNER_FIELD_NUMBER: _ClassVar[int]
+    SHARED_WITH_FIELD_NUMBER: _ClassVar[int]
+    owner: str
+    shared_with: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, owner: _Optional[str] = ..., shared_with: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class DescribeSceneRequest(_message.Message):
     __slots__ = ("scene", "domains", "arrays", "hashes")

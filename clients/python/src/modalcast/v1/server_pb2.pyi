@@ -32,6 +32,18 @@ class GetServerInfoRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class CreateViewerLinkRequest(_message.Message):
+    __slots__ = ("principal",)
+    PRINCIPAL_FIELD_NUMBER: _ClassVar[int]
+    principal: str
+    def __init__(self, principal: _Optional[str] = ...) -> None: ...
+
+class CreateViewerLinkResponse(_message.Message):
+    __slots__ = ("url_path",)
+    URL_PATH_FIELD_NUMBER: _ClassVar[int]
+    url_path: str
+    def __init__(self, url_path: _Optional[str] = ...) -> None: ...
+
 class GetServerInfoResponse(_message.Message):
     __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features", "viewer_url_path")
     VERSION_FIELD_NUMBER: _ClassVar[int]

@@ -66,6 +66,22 @@ pub(crate) enum Command {
         #[arg(long)]
         take_over: bool,
     },
+    /// Print a link to the viewer, which is valid once.
+    Link {
+        /// The principal whose rights the link gives. Default: your own.
+        #[arg(default_value = "")]
+        principal: String,
+        /// The scene to show.
+        #[arg(long)]
+        scene: Option<String>,
+    },
+    /// Share a scene with other principals, in place of those with whom it was shared.
+    Share {
+        /// The scene's name on the server.
+        scene: String,
+        /// Names of principals, or '*' for all. Without names, the scene is no longer shared.
+        principals: Vec<String>,
+    },
     /// Close a scene; the server deletes the files of an uploaded scene.
     Close {
         /// The scene's name on the server.

@@ -33,5 +33,13 @@ async fn run_command(arguments: &Cli) -> Result<()> {
         Command::List => output::print_list(&client, as_json).await,
         Command::Reset { scene, take_over } => client.reset_scene(scene, *take_over).await.map(drop),
         Command::Close { scene } => client.delete_scene(scene).await,
+        Command::Link { principal, scene } => {
+            let path = client.create_viewer_link(principal).await?;
+            output::print_link(&arguments.server, &path, scene.as_deref());
+            Ok(())
+        }
+        Command::Share { scene, principals } => {
+            client.share_scene(scene, &principals.iter().map(String::as_str).collect::<Vec<_>>()).await
+        }
     }
 }

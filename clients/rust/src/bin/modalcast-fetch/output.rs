@@ -212,6 +212,18 @@ fn scene_json(scene: &SceneInfo) -> Value {
     })
 }
 
+/// Prints a link to the viewer. `server` is the URL that the user has named. The path of a server without authentication
+/// has no fragment.
+pub(crate) fn print_link(server: &str, path: &str, scene: Option<&str>) {
+    let separator = if path.contains('#') { '&' } else { '#' };
+    let scene = scene.map(|scene| format!("{separator}scene={scene}")).unwrap_or_default();
+    match server.starts_with("unix:") {
+        // A browser cannot open a socket.
+        true => println!("http://HOST:PORT{path}{scene}"),
+        false => println!("{}{path}{scene}", server.trim_end_matches('/')),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
