@@ -23,6 +23,7 @@ FUZZERS = {
     "cubic_forces": "cub",
     "steps": "step",
     "calls": "drive_scene upload_arrays upload_scene",
+    "credentials": "principals websocket",
 }
 TARGETS = {target: fuzzer for fuzzer, targets in FUZZERS.items() for target in targets.split()}
 

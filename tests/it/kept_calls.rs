@@ -1,7 +1,7 @@
 //! Seeds and kept inputs of the fuzzer of calls cause neither a panic of the server nor leftovers, and use little memory.
 
 #[path = "../../deploy/fuzz/replay.rs"]
-mod replay;
+pub(crate) mod replay;
 #[path = "../../deploy/fuzz/calls/seeds.rs"]
 mod seeds;
 #[path = "../../deploy/fuzz/calls/target.rs"]

@@ -23,6 +23,7 @@ mod identity;
 mod import_cycles;
 mod invalid_input;
 mod kept_calls;
+mod kept_credentials;
 mod layering;
 mod light;
 mod loads;

@@ -33,6 +33,7 @@ ITEMS = {
     14: ("viewer_port recordings forces", "the viewer's port, recordings and forces"),
     15: ("kept_inputs", "fuzzing"),
     16: (None, "soak: 16 clients that come and go"),
+    17: ("credentials", "callers without a credential, and guessed tokens"),
 }
 
 # For items with checks, the part of the subject that is not claimed.
