@@ -9,7 +9,7 @@ from pathlib import Path
 import websocket
 from client import DESCRIBE_SCENE, HEALTH_WATCH, Client, scenes_pb2, slowest_service, time_to_serve
 from floods import check_floods
-from replies import ALL_ARRAYS, SIDE, describe_whole
+from replies import ALL_ARRAYS
 from report import Result, mb
 from scenes import write_grid
 from server import Peak, Server
@@ -31,6 +31,9 @@ CONNECTIONS = 1024
 HALF_SENT_CONNECTIONS = 48
 HALF_SENT_BYTES = 12 << 20
 MAX_HALF_SENT_MEMORY = 256 << 20
+
+# Vertices per side of the scene that is described.
+SIDE = 400
 
 # Each of UNREAD_CONNECTIONS connections opens UNREAD_CALLS calls and reads nothing for DURATION seconds. The memory may
 # grow by MAX_UNREAD_MEMORY bytes.
@@ -190,15 +193,25 @@ def half_sent_messages(program):
     )
 
 
+def describe_whole(server, request):
+    """Seconds in which a new client receives a description."""
+    start = time.monotonic()
+    with Client(server) as client:
+        for _ in client.scenes.DescribeScene(request, timeout=60):
+            pass
+    return time.monotonic() - start
+
+
 def unread(program, flags):
     """Growth of the memory while viewers read nothing, and the slowest description for another client."""
-    request = scenes_pb2.DescribeSceneRequest(scene="grid", arrays=ALL_ARRAYS).SerializeToString()
+    description = scenes_pb2.DescribeSceneRequest(scene="grid", arrays=ALL_ARRAYS)
+    request = description.SerializeToString()
     with tempfile.TemporaryDirectory() as folder:
         write_grid(Path(folder) / "grid.obj", SIDE)
         with Server(program, *flags, scenes=folder) as server:
             with Client(server) as client:
                 client.open_scene("grid.obj", "grid")
-            describe_whole(server)
+            describe_whole(server, description)
             memory, slowest = Peak(server.memory), 0.0
             connections = [WebSocket(server, receive_buffer=4096) for _ in range(UNREAD_CONNECTIONS)]
             for connection in connections:
@@ -206,7 +219,7 @@ def unread(program, flags):
                     connection.send(websocket.start_call(call + 1, DESCRIBE_SCENE, request))
             end = time.monotonic() + DURATION
             while time.monotonic() < end:
-                slowest = max(slowest, describe_whole(server)[0])
+                slowest = max(slowest, describe_whole(server, description))
                 memory.sample()
                 time.sleep(0.05)
             for connection in connections:
