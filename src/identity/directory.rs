@@ -1,19 +1,16 @@
 //! Finds the principal of a credential.
 
-use std::fs;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
+use super::certificate_name::CertificateName;
+use super::file_version::{FileVersion, REFRESH_INTERVAL};
 use super::principal::{Credential, OWNER, Principal};
 use super::principals_file::Credentials;
 use super::token::{TokenHash, read_or_create_token};
 use super::viewer_sessions::ViewerSessions;
 use modalcast_model::error::Result;
-
-/// How often the file of principals is compared with the last one, and tokens are checked for their end.
-const REFRESH_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The credentials of a server. Its own user and its own token identify the owner; a file names further principals.
 #[derive(Debug)]
@@ -33,22 +30,6 @@ struct DirectoryState {
     version: Option<FileVersion>,
 }
 
-/// Changes when a file is written or replaced.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct FileVersion {
-    inode: u64,
-    bytes: u64,
-    modified: (i64, i64),
-}
-
-impl FileVersion {
-    fn of(path: &Path) -> Option<Self> {
-        let metadata = fs::metadata(path).ok()?;
-        let modified = (metadata.mtime(), metadata.mtime_nsec());
-        Some(Self { inode: metadata.ino(), bytes: metadata.len(), modified })
-    }
-}
-
 impl Directory {
     /// Reads the server's own token, or creates it, and the file of principals.
     ///
@@ -56,7 +37,6 @@ impl Directory {
     /// `Unavailable` for the file of the token; `InvalidFile` for that of the principals.
     pub fn open(token_file: &Path, principals: Option<&Path>) -> Result<Self> {
         let own_uid = rustix::process::geteuid().as_raw();
-        // The version is older than the contents if the file changes between the two, so that it is read again.
         let version = principals.and_then(FileVersion::of);
         let credentials =
             principals.map_or_else(|| Ok(Credentials::default()), |path| Credentials::read(path, own_uid))?;
@@ -80,6 +60,12 @@ impl Directory {
             return Some(Arc::clone(&self.owner));
         }
         self.lock().credentials.by_uid.get(&uid).cloned()
+    }
+
+    /// The credential of a client certificate with these names. The first name that a principal has decides.
+    pub fn find_certificate(&self, names: &[CertificateName]) -> Option<Arc<Credential>> {
+        let state = self.lock();
+        names.iter().find_map(|name| state.credentials.by_certificate.get(name)).cloned()
     }
 
     /// The credential of a bearer token.
@@ -141,6 +127,8 @@ impl Directory {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     struct Files {
@@ -226,6 +214,32 @@ mod tests {
         files.write("");
         directory.refresh(SystemTime::now());
         assert!(anna.is_revoked() && ben.is_revoked() && directory.find_token("a").is_none());
+    }
+
+    #[test]
+    fn first_known_name_of_a_certificate_identifies_a_principal() {
+        let files = Files::new(
+            "[[principal]]\nname = 'anna'\nrole = 'drive'\ncertificates = ['Anna.lab.example', 'anna@lab.example']\n\
+             [[principal]]\nname = 'ben'\nrole = 'view'\ncertificates = ['spiffe://lab.example/ben']\n",
+        );
+        let directory = files.open();
+        let find = |names: &[&str]| {
+            let names: Vec<_> = names.iter().map(|name| CertificateName::new(name)).collect();
+            directory.find_certificate(&names)
+        };
+        assert_eq!(name_of(find(&["anna.lab.example"])).as_deref(), Some("anna"));
+        assert_eq!(
+            name_of(find(&["host.lab.example", "spiffe://lab.example/ben", "anna@lab.example"])),
+            Some("ben".into())
+        );
+        for names in [&[][..], &["lab.example"], &["spiffe://lab.example/BEN"], &["anna"], &["owner"]] {
+            assert_eq!(name_of(find(names)), None, "{names:?}");
+        }
+        let anna = find(&["anna@lab.example"]).expect("expected a principal");
+        files.write("[[principal]]\nname = 'anna'\nrole = 'drive'\ncertificates = ['anna.lab.example']\n");
+        directory.refresh(SystemTime::now());
+        assert!(anna.is_revoked() && find(&["anna@lab.example"]).is_none());
+        assert!(find(&["anna.lab.example"]).is_some_and(|credential| !credential.is_revoked()));
     }
 
     #[test]

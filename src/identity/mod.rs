@@ -4,14 +4,18 @@
 //! Trusted are the user of the server, root, and users of the GPU device, who can read its memory. Not trusted are other
 //! accounts of the machine, web pages, the network, and other principals of the server beyond their roles.
 
+mod certificate_name;
 mod directory;
+mod file_version;
 mod principal;
 mod principals_file;
 mod role;
 mod token;
 mod viewer_sessions;
 
+pub use certificate_name::CertificateName;
 pub use directory::Directory;
+pub use file_version::{FileVersion, REFRESH_INTERVAL};
 pub use principal::{Credential, OWNER, Principal};
 pub use principals_file::check_principal_name;
 pub use role::Role;

@@ -24,9 +24,8 @@ impl Principal {
     }
 }
 
-/// What identifies a principal: the user of a Unix socket's client, a bearer token, or an administrator who makes a link
-/// to the viewer for it. It can be
-/// revoked, which ends the calls that it has admitted.
+/// What identifies a principal: the user of a Unix socket's client, a name of a client certificate, a bearer token, or an
+/// administrator who makes a link to the viewer for it. It can be revoked, which ends the calls that it has admitted.
 #[derive(Debug)]
 pub struct Credential {
     principal: Arc<Principal>,

@@ -6,6 +6,7 @@
 //! name = "anna"
 //! role = "drive"
 //! uids = [1001]
+//! certificates = ["anna.lab.example"]
 //!
 //! [[principal]]
 //! name = "dashboard"
@@ -24,6 +25,7 @@ use std::time::SystemTime;
 
 use serde::Deserialize;
 
+use super::certificate_name::CertificateName;
 use super::principal::{Credential, OWNER, Principal};
 use super::role::Role;
 use super::token::TokenHash;
@@ -32,8 +34,11 @@ use modalcast_model::error::{Error, Result, invalid};
 /// Limit on the principals of a file.
 const MAX_PRINCIPALS: usize = 256;
 
-/// Limit on the user ids, and on the tokens, of one principal.
+/// Limit on the user ids, on the certificates, and on the tokens, of one principal.
 const MAX_CREDENTIALS: usize = 256;
+
+/// Limit on the bytes of a certificate's name.
+const MAX_CERTIFICATE_NAME_BYTES: usize = 512;
 
 /// Limit on the characters of a name.
 const MAX_NAME_CHARS: usize = 64;
@@ -48,6 +53,7 @@ const OTHERS_WRITE: u32 = 0o022;
 #[derive(Debug, Default)]
 pub(super) struct Credentials {
     pub(super) by_uid: BTreeMap<u32, Arc<Credential>>,
+    pub(super) by_certificate: BTreeMap<CertificateName, Arc<Credential>>,
     pub(super) by_token: BTreeMap<TokenHash, Arc<Credential>>,
     /// For the viewer sessions that an administrator gives to principals, by their names.
     pub(super) by_name: BTreeMap<String, Arc<Credential>>,
@@ -67,6 +73,8 @@ struct PrincipalEntry {
     role: Role,
     #[serde(default)]
     uids: Vec<u32>,
+    #[serde(default)]
+    certificates: Vec<String>,
     #[serde(default)]
     token: Vec<TokenEntry>,
 }
@@ -130,7 +138,9 @@ impl Credentials {
     fn add(&mut self, entry: PrincipalEntry, own_uid: u32) -> Result<()> {
         let principal = Arc::new(Principal { name: entry.name, role: entry.role });
         self.by_name.insert(principal.name.clone(), Credential::new(Arc::clone(&principal), None));
-        for (field, count) in [("uids", entry.uids.len()), ("token", entry.token.len())] {
+        let counts =
+            [("uids", entry.uids.len()), ("certificates", entry.certificates.len()), ("token", entry.token.len())];
+        for (field, count) in counts {
             if count > MAX_CREDENTIALS {
                 return Err(invalid(field, format!("at most {MAX_CREDENTIALS} entries"), count));
             }
@@ -143,6 +153,18 @@ impl Credentials {
             let credential = Credential::new(Arc::clone(&principal), None);
             if self.by_uid.insert(uid, credential).is_some() {
                 return Err(invalid(field(), "a user id that occurs once in the file", uid));
+            }
+        }
+        for (index, name) in entry.certificates.into_iter().enumerate() {
+            let field = || format!("certificates[{index}]");
+            if name.is_empty() || name.len() > MAX_CERTIFICATE_NAME_BYTES {
+                let expected = format!("a name of 1 to {MAX_CERTIFICATE_NAME_BYTES} bytes");
+                return Err(invalid(field(), expected, format!("{} bytes", name.len())));
+            }
+            let credential = Credential::new(Arc::clone(&principal), None);
+            if self.by_certificate.insert(CertificateName::new(&name), credential).is_some() {
+                let given = format!("'{}'", name.escape_debug());
+                return Err(invalid(field(), "a name that occurs once in the file", given));
             }
         }
         for (index, TokenEntry { sha256, expires }) in entry.token.into_iter().enumerate() {
@@ -164,13 +186,15 @@ impl Credentials {
 
     /// All credentials.
     pub(super) fn all(&self) -> impl Iterator<Item = &Arc<Credential>> {
-        self.by_uid.values().chain(self.by_token.values()).chain(self.by_name.values())
+        let by_connection = self.by_uid.values().chain(self.by_certificate.values());
+        by_connection.chain(self.by_token.values()).chain(self.by_name.values())
     }
 
     /// Replaces the credentials that have an equal one in `former` by it, so that these calls continue, and revokes the
     /// other ones of `former`.
     pub(super) fn take_over(&mut self, former: &Self) {
         take_over_equal(&mut self.by_uid, &former.by_uid);
+        take_over_equal(&mut self.by_certificate, &former.by_certificate);
         take_over_equal(&mut self.by_token, &former.by_token);
         take_over_equal(&mut self.by_name, &former.by_name);
     }
@@ -247,6 +271,8 @@ mod tests {
             (format!("{anna}uids = [1000]"), "principal[0].uids[0]"),
             (format!("{anna}uids = [7, 7]"), "principal[0].uids[1]"),
             (format!("{anna}uids = [-1]"), "line 4"),
+            (format!("{anna}certificates = ['a.example', 'A.example']"), "principal[0].certificates[1]"),
+            (format!("{anna}certificates = ['']"), "principal[0].certificates[0]"),
             (token("sha256 = 'abc'"), "principal[0].token[0].sha256"),
             (token(&format!("sha256 = '{DIGITS}'\nexpires = 'tomorrow'")), "principal[0].token[0].expires"),
             (token(&format!("sha256 = '{DIGITS}'\n[[principal.token]]\nsha256 = '{DIGITS}'")), "token[1].sha256"),
