@@ -102,7 +102,7 @@ pub(crate) struct PhysicsOptions {
 /// The server, the scene, and the format of the output.
 #[derive(Debug, Clone, Args)]
 pub(crate) struct ServerOptions {
-    /// URL of the server: http://HOST:PORT or unix:PATH.
+    /// URL of the server: http://HOST:PORT, https://HOST:PORT or unix:PATH.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// Maximum time to retry until the server answers, in seconds.

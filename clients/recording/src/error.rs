@@ -70,7 +70,7 @@ impl Error {
 
 const fn client_exit_code(error: &ClientError) -> u8 {
     match error {
-        ClientError::Connect { .. } | ClientError::ProtocolVersion { .. } => 5,
+        ClientError::Connect { .. } | ClientError::Certificate { .. } | ClientError::ProtocolVersion { .. } => 5,
         ClientError::Step { .. } => 3,
         ClientError::Rejected(rejection) => reason_exit_code(rejection.reason),
         ClientError::Status { rejection: Some(rejection), .. } => reason_exit_code(rejection.reason),

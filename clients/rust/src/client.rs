@@ -11,7 +11,7 @@ use tonic::transport::Endpoint;
 use tonic::{Response, Status, Streaming};
 
 use crate::assemble::Replies;
-use crate::error::{Error, Result, describe_causes, malformed_reply};
+use crate::error::{Error, Result, malformed_reply};
 use crate::message_stream::{MessageStream, UndecodedChannel};
 use crate::request::Delivery;
 use crate::server_address::{ConnectOptions, ServerAddress};
@@ -90,12 +90,12 @@ impl ServerInfo {
 
 impl Client {
     /// Connects, with a timeout of five seconds, and checks that the server has the protocol version of this client.
-    /// `url` is `http://host:port`, `host:port`, or `unix:path` for a Unix socket. A server of this user on this machine
+    /// `url` is `https://host:port`, `http://host:port`, `host:port` (plain), or `unix:path` for a Unix socket. A server of this user on this machine
     /// is reached at its Unix socket, which needs no token. For others, set a token by [`Self::connect_with`], or the
     /// environment variable `MODALCAST_TOKEN_FILE` to the path of a file with a token.
     ///
     /// # Errors
-    /// `Connect` if the URL is invalid or no server answers; `ProtocolVersion` if the server has another version;
+    /// `Connect` if the URL is invalid or no server answers; `Certificate` if that of the server is not accepted; `ProtocolVersion` if the server has another version;
     /// `Status` if the server is not a modalcast server, or does not know the caller.
     pub async fn connect(url: &str) -> Result<Self> {
         Self::connect_with(url, &ConnectOptions::default()).await
@@ -106,37 +106,43 @@ impl Client {
     /// # Errors
     /// As for [`Self::connect`].
     pub async fn connect_with(url: &str, options: &ConnectOptions) -> Result<Self> {
-        let connect_error =
-            |error: tonic::transport::Error| Error::Connect { url: url.to_owned(), reason: describe_causes(&error) };
-        let ServerAddress { url: server_url, authorization } = ServerAddress::find(url, options)?;
-        let endpoint = Endpoint::from_shared(server_url)
+        let connect_error = |error: tonic::transport::Error| Error::of_connection(url, &error);
+        let ServerAddress { url: server_url, metadata, tls } = ServerAddress::find(url, options)?;
+        let mut endpoint = Endpoint::from_shared(server_url)
             .map_err(connect_error)?
             .connect_timeout(CONNECT_TIMEOUT)
             .max_frame_size(MAX_FRAME_SIZE)
             .http2_keep_alive_interval(KEEP_ALIVE)
             .keep_alive_timeout(KEEP_ALIVE);
+        if let Some(tls) = tls {
+            endpoint = endpoint.tls_config(tls.timeout(CONNECT_TIMEOUT)).map_err(connect_error)?;
+        }
         let with_window = |stream_window: u32| {
             let endpoint = endpoint.clone().initial_stream_window_size(stream_window);
             endpoint.initial_connection_window_size(STREAMS_PER_CONNECTION_WINDOW * stream_window)
         };
-        let authorized = |channel| ServerChannel { channel, authorization: authorization.clone() };
+        let with_metadata = |channel| ServerChannel { channel, metadata: metadata.clone() };
         let client = Self {
-            channel: authorized(with_window(STREAM_WINDOW).connect().await.map_err(connect_error)?),
-            lossless_channel: authorized(with_window(LOSSLESS_STREAM_WINDOW).connect_lazy()),
+            channel: with_metadata(with_window(STREAM_WINDOW).connect().await.map_err(connect_error)?),
+            lossless_channel: with_metadata(with_window(LOSSLESS_STREAM_WINDOW).connect_lazy()),
             max_reply_bytes: REPLY_LIMIT,
             shared_memory: None,
             url: url.into(),
         };
         let no_answer = |_| Error::Connect { url: url.to_owned(), reason: "the server does not answer calls".into() };
-        let info = tokio::time::timeout(CONNECT_TIMEOUT, client.get_server_info()).await.map_err(no_answer)??;
+        // A server rejects a client certificate, and a plain connection, after the client's end of the handshake.
+        let mut service = v1::server_service_client::ServerServiceClient::new(client.channel.clone());
+        let first_call = tokio::time::timeout(CONNECT_TIMEOUT, service.get_server_info(v1::GetServerInfoRequest {}));
+        let first_reply = first_call.await.map_err(no_answer)?.map_err(|status| Error::of_first_call(status, url))?;
+        let info = first_reply.into_inner();
         match info.protocol_version {
             v1::PROTOCOL_VERSION => Ok(client),
             server => Err(Error::ProtocolVersion { url: url.to_owned(), client: v1::PROTOCOL_VERSION, server }),
         }
     }
 
-    /// Connects, and retries until a server answers or `timeout` has passed. An answer with another protocol version
-    /// ends the attempts.
+    /// Connects, and retries until a server answers or `timeout` has passed. Another protocol version, and a certificate that
+    /// is not accepted, end the attempts.
     ///
     /// # Errors
     /// As for [`Self::connect`], with the reason of the last attempt.

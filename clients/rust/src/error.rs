@@ -2,6 +2,7 @@
 
 use modalcast_proto::v1;
 pub use modalcast_proto::v1::Reason;
+use tokio_rustls::rustls::{CertificateError, Error as TlsError, InvalidMessage};
 use tonic_types::StatusExt as _;
 
 /// The result type of this crate.
@@ -62,6 +63,9 @@ pub enum Error {
     /// The connection failed or was lost.
     #[error("{url}: no connection: {reason}")]
     Connect { url: String, reason: String },
+    /// The certificate of the server is not accepted: it is of an unknown authority, for another host, or not valid now.
+    #[error("{url}: the certificate of the server is not accepted: {reason}")]
+    Certificate { url: String, reason: String },
     /// The server has another version of the wire contract than this client, so they cannot communicate.
     #[error("{url}: expected a server of protocol version {client}, got version {server}")]
     ProtocolVersion { url: String, client: u32, server: u32 },
@@ -110,6 +114,38 @@ pub(crate) fn malformed_reply(field: impl Into<String>, expected: impl ToString,
 }
 
 impl Error {
+    /// Converts the error of a connection attempt.
+    pub(crate) fn of_connection(url: &str, error: &tonic::transport::Error) -> Self {
+        let (url, reason) = (url.to_owned(), describe_causes(error));
+        match find_tls_error(error) {
+            Some(TlsError::InvalidCertificate(CertificateError::UnknownIssuer)) => {
+                let remedy = "name the file of its authority by `ConnectOptions::with_ca_file` or MODALCAST_CA_FILE";
+                Self::Certificate { url, reason: format!("its authority is unknown; {remedy}") }
+            }
+            Some(TlsError::InvalidCertificate(error)) => Self::Certificate { url, reason: error.to_string() },
+            Some(TlsError::InvalidMessage(InvalidMessage::InvalidContentType)) => {
+                Self::Connect { url, reason: "expected TLS, got another protocol; a plain server has http://".into() }
+            }
+            _ => Self::Connect { url, reason },
+        }
+    }
+
+    /// Converts the gRPC status of the first call on a connection. A status with a cause is not of the server: the
+    /// connection has ended.
+    pub(crate) fn of_first_call(status: tonic::Status, url: &str) -> Self {
+        match std::error::Error::source(&status) {
+            Some(cause) if url.starts_with("https://") => {
+                let reason = format!("{}. The server may not accept the client certificate", describe_causes(cause));
+                Self::Connect { url: url.to_owned(), reason }
+            }
+            Some(cause) => {
+                let reason = format!("{}. A server that expects TLS has https:// in its URL", describe_causes(cause));
+                Self::Connect { url: url.to_owned(), reason }
+            }
+            None => Self::from_status(status, url),
+        }
+    }
+
     /// Converts the gRPC status of a call. `url` is the server's URL.
     pub(crate) fn from_status(status: tonic::Status, url: &str) -> Self {
         if is_connection_lost(&status) {
@@ -128,6 +164,15 @@ fn is_connection_lost(status: &tonic::Status) -> bool {
         tonic::Code::Unknown | tonic::Code::Internal | tonic::Code::Unavailable => !is_of_server,
         _ => false,
     }
+}
+
+/// The error of TLS among the causes of an error.
+fn find_tls_error<'a>(error: &'a (dyn std::error::Error + 'static)) -> Option<&'a TlsError> {
+    std::iter::successors(Some(error), |error| error.source()).find_map(|cause| {
+        // The source of an I/O error is not the error inside, but the source of that one.
+        let inner = cause.downcast_ref::<std::io::Error>().and_then(std::io::Error::get_ref);
+        inner.and_then(|inner| inner.downcast_ref()).or_else(|| cause.downcast_ref())
+    })
 }
 
 /// Joins the messages of an error and its causes, because tonic's own message is only "transport error".

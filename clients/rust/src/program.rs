@@ -34,12 +34,14 @@ pub fn run<E: Display>(
 
 /// Maps an error of the client to an exit code:
 /// - 1: the server rejected the request, or a step is too large to be encoded as one message
-/// - 3: the connection failed or was lost, or the server has another protocol version
+/// - 3: the connection failed or was lost, the server's certificate is not accepted, or the server has another protocol
+///   version
 /// - 4: a local file cannot be read or written
 /// - 5: a reply is malformed, truncated or late
 pub const fn exit_code(error: &Error) -> u8 {
     match error {
         Error::Connect { .. }
+        | Error::Certificate { .. }
         | Error::ProtocolVersion { .. }
         | Error::Status { code: tonic::Code::Unavailable, .. } => 3,
         Error::Status { .. } | Error::Rejected(_) | Error::Step { .. } => 1,

@@ -4,12 +4,16 @@ use std::net::IpAddr;
 use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _};
 use std::path::{Path, PathBuf};
 
-use tonic::codegen::http::{HeaderValue, Uri};
+use tonic::codegen::http::{HeaderMap, HeaderName, HeaderValue, Uri, header};
+use tonic::transport::{Certificate, ClientTlsConfig, Identity};
 
 use crate::error::{Error, Result};
 
 /// The environment variable with the path of a file that contains a token.
 const TOKEN_FILE_VARIABLE: &str = "MODALCAST_TOKEN_FILE";
+
+/// The environment variable with the path of a file that contains the certificates of authorities.
+const CA_FILE_VARIABLE: &str = "MODALCAST_CA_FILE";
 
 /// Port of a server, unless its address has another one.
 const DEFAULT_PORT: u16 = 50051;
@@ -18,6 +22,16 @@ const DEFAULT_PORT: u16 = 50051;
 #[derive(Clone, Default)]
 pub struct ConnectOptions {
     token: Option<String>,
+    ca_file: Option<PathBuf>,
+    client_certificate: Option<ClientCertificate>,
+    metadata: Vec<(String, String)>,
+}
+
+/// The files of a client certificate.
+#[derive(Debug, Clone)]
+struct ClientCertificate {
+    certificate: PathBuf,
+    key: PathBuf,
 }
 
 impl ConnectOptions {
@@ -25,57 +39,130 @@ impl ConnectOptions {
     /// machine.
     #[must_use]
     pub fn with_token(self, token: impl Into<String>) -> Self {
-        Self { token: Some(token.into()) }
+        Self { token: Some(token.into()), ..self }
+    }
+
+    /// Accepts only servers with a certificate of an authority in a PEM file, for `https`. A self-signed certificate is its
+    /// own authority. Without this option, the environment variable `MODALCAST_CA_FILE` names the file; without both, the
+    /// authorities of the system are accepted.
+    #[must_use]
+    pub fn with_ca_file(self, path: impl Into<PathBuf>) -> Self {
+        Self { ca_file: Some(path.into()), ..self }
+    }
+
+    /// Identifies the client by a certificate, for `https`. Both files are PEM.
+    #[must_use]
+    pub fn with_client_certificate(self, certificate: impl Into<PathBuf>, key: impl Into<PathBuf>) -> Self {
+        let files = ClientCertificate { certificate: certificate.into(), key: key.into() };
+        Self { client_certificate: Some(files), ..self }
+    }
+
+    /// Sends metadata with every call, for a proxy in front of the server.
+    #[must_use]
+    pub fn with_metadata(mut self, name: impl Into<String>, value: impl Into<String>) -> Self {
+        self.metadata.push((name.into(), value.into()));
+        self
     }
 }
 
-/// The token is a secret.
+/// The token and the values of the metadata are secrets.
 impl std::fmt::Debug for ConnectOptions {
     fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        out.debug_struct("ConnectOptions").field("has_token", &self.token.is_some()).finish()
+        let names: Vec<&String> = self.metadata.iter().map(|(name, _)| name).collect();
+        out.debug_struct("ConnectOptions")
+            .field("has_token", &self.token.is_some())
+            .field("ca_file", &self.ca_file)
+            .field("client_certificate", &self.client_certificate)
+            .field("metadata", &names)
+            .finish()
     }
 }
 
-/// Where a server is, and the credential of its calls.
-#[derive(Debug, Clone, PartialEq)]
+/// Where a server is, and what its calls and connections need.
+#[derive(Debug, Clone)]
 pub(crate) struct ServerAddress {
-    /// `http://HOST:PORT` or `unix:PATH`.
+    /// `http://HOST:PORT`, `https://HOST:PORT` or `unix:PATH`.
     pub(crate) url: String,
-    pub(crate) authorization: Option<HeaderValue>,
+    /// Sent with every call.
+    pub(crate) metadata: HeaderMap,
+    /// `None` without encryption.
+    pub(crate) tls: Option<ClientTlsConfig>,
 }
 
 impl ServerAddress {
-    /// The address for a URL: `http://HOST:PORT`, `HOST:PORT` or `unix:PATH`. Without a token, a server on this machine
-    /// is reached at its Unix socket, where the user of this process is its own credential.
+    /// The address for a URL: `http://HOST:PORT`, `https://HOST:PORT`, `HOST:PORT` (plain) or `unix:PATH`. Without a token,
+    /// a plain server on this machine is reached at its Unix socket, where the user of this process is its own credential.
     ///
     /// # Errors
-    /// `Connect` when the token is malformed or its file cannot be read.
+    /// `Connect` when an option is malformed, a file cannot be read, or files of certificates are given without `https`.
     pub(crate) fn find(url: &str, options: &ConnectOptions) -> Result<Self> {
         let connect_error = |reason: String| Error::Connect { url: url.to_owned(), reason };
         let has_scheme = url.contains("://") || url.starts_with("unix:");
         let url_with_scheme = if has_scheme { url.to_owned() } else { format!("http://{url}") };
+        let tls = find_tls(&url_with_scheme, options).map_err(connect_error)?;
+        let mut metadata = metadata_of(options).map_err(connect_error)?;
         let token = match &options.token {
             Some(token) => Some(token.clone()),
             None if url.starts_with("unix:") => None,
-            None => match std::env::var_os(TOKEN_FILE_VARIABLE).filter(|path| !path.is_empty()) {
-                Some(path) => Some(read_token(Path::new(&path)).map_err(connect_error)?),
+            None => match environment_path(TOKEN_FILE_VARIABLE) {
+                Some(path) => Some(read_text(TOKEN_FILE_VARIABLE, &path).map_err(connect_error)?),
                 None => None,
             },
         };
         let Some(token) = token else {
             let socket = local_port(&url_with_scheme).and_then(|port| find_socket(&local_sockets()?, port));
             let url = socket.map_or(url_with_scheme, |path| format!("unix:{}", path.display()));
-            return Ok(Self { url, authorization: None });
+            return Ok(Self { url, metadata, tls });
         };
         let mut authorization = HeaderValue::try_from(format!("Bearer {}", token.trim()))
             .map_err(|_| connect_error("expected a token of visible ASCII letters, got another text".into()))?;
         authorization.set_sensitive(true);
-        Ok(Self { url: url_with_scheme, authorization: Some(authorization) })
+        metadata.insert(header::AUTHORIZATION, authorization);
+        Ok(Self { url: url_with_scheme, metadata, tls })
     }
 }
 
-fn read_token(path: &Path) -> Result<String, String> {
-    std::fs::read_to_string(path).map_err(|error| format!("{TOKEN_FILE_VARIABLE}: {}: {error}", path.display()))
+/// The encryption of a URL with the scheme `https`. `None` for another scheme.
+fn find_tls(url: &str, options: &ConnectOptions) -> Result<Option<ClientTlsConfig>, String> {
+    let uri: Option<Uri> = url.parse().ok();
+    let Some(uri) = uri.filter(|uri| uri.scheme_str() == Some("https")) else {
+        let needs_tls = options.ca_file.is_some() || options.client_certificate.is_some();
+        return if needs_tls { Err("expected https:// with certificates, got another URL".into()) } else { Ok(None) };
+    };
+    let host = uri.host().unwrap_or_default().trim_start_matches('[').trim_end_matches(']');
+    let mut tls = ClientTlsConfig::new().domain_name(host);
+    let ca_file = options.ca_file.clone().map(|path| ("CA file", path));
+    tls = match ca_file.or_else(|| Some((CA_FILE_VARIABLE, environment_path(CA_FILE_VARIABLE)?))) {
+        Some((name, path)) => tls.ca_certificate(Certificate::from_pem(read_text(name, &path)?)),
+        None => tls.with_native_roots(),
+    };
+    if let Some(ClientCertificate { certificate, key }) = &options.client_certificate {
+        let (certificate, key) = (read_text("client certificate", certificate)?, read_text("key", key)?);
+        tls = tls.identity(Identity::from_pem(certificate, key));
+    }
+    Ok(Some(tls))
+}
+
+fn metadata_of(options: &ConnectOptions) -> Result<HeaderMap, String> {
+    let mut metadata = HeaderMap::new();
+    for (name, value) in &options.metadata {
+        let invalid =
+            || format!("metadata '{name}': expected a name of lower-case letters and a value of ASCII letters");
+        let header_name = HeaderName::from_lowercase(name.as_bytes()).map_err(|_| invalid())?;
+        let mut value = HeaderValue::try_from(value).map_err(|_| invalid())?;
+        value.set_sensitive(true);
+        metadata.append(header_name, value);
+    }
+    Ok(metadata)
+}
+
+fn environment_path(variable: &str) -> Option<PathBuf> {
+    std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from)
+}
+
+/// `name` is that of the file in errors.
+fn read_text(name: &str, path: &Path) -> Result<String, String> {
+    std::fs::read_to_string(path).map_err(|error| format!("{name}: {}: {error}", path.display()))
 }
 
 /// The port of a URL that leads to this machine.
@@ -88,7 +175,7 @@ fn local_port(url: &str) -> Option<u16> {
 
 /// The folder of the sockets of this user's servers. The server uses the same rule.
 fn local_sockets() -> Option<PathBuf> {
-    let folder = |name: &str| std::env::var_os(name).filter(|path| !path.is_empty()).map(PathBuf::from);
+    let folder = environment_path;
     match folder("XDG_RUNTIME_DIR") {
         Some(runtime) => Some(runtime.join("modalcast")),
         None => {
@@ -156,8 +243,40 @@ mod tests {
         let options = ConnectOptions::default().with_token("secret");
         let address = ServerAddress::find("192.0.2.1:50051", &options).expect("expected an address");
         assert_eq!(address.url, "http://192.0.2.1:50051");
-        assert_eq!(address.authorization.as_ref().map(HeaderValue::as_bytes), Some(&b"Bearer secret"[..]));
+        let authorization = address.metadata.get(header::AUTHORIZATION);
+        assert_eq!(authorization.map(HeaderValue::as_bytes), Some(&b"Bearer secret"[..]));
         assert!(!format!("{address:?} {options:?}").contains("secret"));
         assert!(ServerAddress::find("192.0.2.1:1", &ConnectOptions::default().with_token("a\nb")).is_err());
+    }
+
+    #[test]
+    fn metadata_are_sent_and_their_values_not_shown() {
+        let options = ConnectOptions::default().with_metadata("x-scene", "secret").with_token("abc");
+        let address = ServerAddress::find("192.0.2.1:50051", &options).expect("expected an address");
+        assert_eq!(address.metadata["x-scene"].as_bytes(), b"secret");
+        assert_eq!(address.metadata.len(), 2);
+        assert!(!format!("{address:?} {options:?}").contains("secret"));
+        for (name, value) in [("X-Scene", "a"), ("", "a"), ("x scene", "a"), ("x-scene", "a\n")] {
+            let options = ConnectOptions::default().with_metadata(name, value);
+            assert!(ServerAddress::find("192.0.2.1:1", &options).is_err(), "{name}: {value}");
+        }
+    }
+
+    #[test]
+    fn certificates_need_https() {
+        let folder = tempfile::tempdir().expect("expected a temporary folder");
+        let path = folder.path().join("ca.pem");
+        let options = ConnectOptions::default().with_ca_file(&path);
+        let find = |url: &str| ServerAddress::find(url, &options).map(|address| address.tls.is_some());
+        let error = find("https://192.0.2.1:1").expect_err("expected an error without the file").to_string();
+        assert!(error.contains("ca.pem"), "{error}");
+        std::fs::write(&path, "").expect("expected a writable folder");
+        assert!(matches!(find("https://192.0.2.1:1"), Ok(true)));
+        for url in ["http://192.0.2.1:1", "192.0.2.1:1", "unix:/run/modalcast.sock"] {
+            let error = find(url).expect_err(url).to_string();
+            assert!(error.contains("expected https://"), "{error}");
+        }
+        let plain = ServerAddress::find("192.0.2.1:1", &ConnectOptions::default().with_token("abc"));
+        assert!(plain.expect("expected an address").tls.is_none());
     }
 }

@@ -1,18 +1,18 @@
-//! The connection of a client, which sends the client's token with every call.
+//! The connection of a client, which sends the client's token and metadata with every call.
 
 use std::task::{Context, Poll};
 
 use tonic::body::Body;
 use tonic::codegen::Service;
-use tonic::codegen::http::{HeaderValue, Request, Response, header};
+use tonic::codegen::http::{HeaderMap, Request, Response};
 use tonic::transport::Channel;
 
 /// A connection for generated clients.
 #[derive(Debug, Clone)]
 pub(crate) struct ServerChannel {
     pub(crate) channel: Channel,
-    /// The value of the header `authorization`.
-    pub(crate) authorization: Option<HeaderValue>,
+    /// Sent with every call.
+    pub(crate) metadata: HeaderMap,
 }
 
 impl Service<Request<Body>> for ServerChannel {
@@ -25,8 +25,8 @@ impl Service<Request<Body>> for ServerChannel {
     }
 
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
-        if let Some(authorization) = &self.authorization {
-            request.headers_mut().insert(header::AUTHORIZATION, authorization.clone());
+        for (name, value) in &self.metadata {
+            request.headers_mut().append(name, value.clone());
         }
         self.channel.call(request)
     }

@@ -11,7 +11,7 @@ use tokio::signal::unix::{SignalKind, signal};
 /// The server to connect to.
 #[derive(Debug, Args)]
 pub(crate) struct ServerOptions {
-    /// URL of the server: http://HOST:PORT or unix:PATH.
+    /// URL of the server: http://HOST:PORT, https://HOST:PORT or unix:PATH.
     #[arg(long, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     server: String,
     /// How long to retry until the server answers, in seconds.

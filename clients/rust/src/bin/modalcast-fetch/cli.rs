@@ -25,7 +25,7 @@ Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connecti
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Cli {
-    /// URL of the server: http://HOST:PORT or unix:PATH.
+    /// URL of the server: http://HOST:PORT, https://HOST:PORT or unix:PATH.
     #[arg(long, global = true, env = "MODALCAST_SERVER", default_value = "http://127.0.0.1:50051")]
     pub(crate) server: String,
     /// Receive frames and vertices in shared memory. PATH is the Unix socket of `modalcast serve --shared-memory PATH`
