@@ -20,6 +20,7 @@ import {
     redeemCode,
     sessionToken,
     UNKNOWN_SESSION_CODE,
+    urlBesidePage,
 } from "./wire/session";
 
 /** Milliseconds until the next attempt to connect: doubled after each one, up to the limit. */
@@ -360,9 +361,7 @@ export class LiveViewer {
 
 /** The WebSocket beside this page. */
 function webSocketUrl(): string {
-    const url = new URL("websocket", location.href);
+    const url = urlBesidePage("websocket");
     url.protocol = url.protocol === "https:" ? "wss:" : "ws:";
-    url.search = "";
-    url.hash = "";
     return url.href;
 }

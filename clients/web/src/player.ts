@@ -4,7 +4,7 @@ import type { App } from "./app";
 import { Playback } from "./source/playback";
 import { decodeBase64, type Recording, readRecording } from "./source/recording";
 import { Timeline } from "./ui/timeline";
-import { redeemCode, sessionToken } from "./wire/session";
+import { redeemCode, sessionToken, urlBesidePage } from "./wire/session";
 
 export class RecordingPlayer {
     private timeline: Timeline | null = null;
@@ -45,7 +45,7 @@ export class RecordingPlayer {
         try {
             await redeemCode();
             const headers = { authorization: `Bearer ${sessionToken() ?? ""}` };
-            const response = await fetch(path, { headers, cache: "no-store" });
+            const response = await fetch(urlBesidePage(path), { headers, cache: "no-store" });
             if (response.status === 403) {
                 const text = "A link is valid once. Start `modalcast view` again for another one.";
                 cover.showMessage("This page needs a new link", text);

@@ -12,6 +12,15 @@ export type CodeResult = "none" | "accepted" | "rejected";
 /** For browsers that do not let the page store anything. */
 let unstored: string | null = null;
 
+/** The URL of a resource of this server. The page may be in a folder of a proxy. */
+export function urlBesidePage(name: string): URL {
+    const url = new URL(location.href);
+    url.pathname = `${location.pathname.replace(/\/+$/, "")}/${name}`;
+    url.search = "";
+    url.hash = "";
+    return url;
+}
+
 /** Several servers can have one host and port behind a proxy, each with its own path. */
 function storageKey(): string {
     return `modalcast-session ${location.pathname}`;
@@ -51,7 +60,7 @@ export async function redeemCode(): Promise<CodeResult> {
     const parameters = new URLSearchParams(location.hash.slice(1));
     const code = parameters.get("code");
     if (code === null) return "none";
-    const response = await fetch("session", { method: "POST", body: code, cache: "no-store" });
+    const response = await fetch(urlBesidePage("session"), { method: "POST", body: code, cache: "no-store" });
     parameters.delete("code");
     const rest = parameters.toString();
     history.replaceState(history.state, "", `${location.pathname}${location.search}${rest ? `#${rest}` : ""}`);
