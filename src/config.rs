@@ -56,6 +56,13 @@ pub enum ListenAddress {
     Unix(PathBuf),
 }
 
+impl ListenAddress {
+    /// Whether other machines can connect to the address.
+    pub fn is_remote(&self) -> bool {
+        matches!(self, Self::Tcp(address) if !address.ip().is_loopback())
+    }
+}
+
 impl std::str::FromStr for ListenAddress {
     type Err = String;
 
@@ -77,13 +84,86 @@ impl std::fmt::Display for ListenAddress {
     }
 }
 
+/// The certificate of the server's TCP sockets.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ServerCertificate {
+    /// PEM files, which are read again when they change.
+    Files { certificate: PathBuf, key: PathBuf },
+    /// A certificate that the server makes and keeps in the state folder, with the names and addresses of this machine and
+    /// these further names.
+    SelfSigned { names: Vec<String> },
+}
+
+/// Encryption of the TCP sockets.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TlsSettings {
+    pub certificate: ServerCertificate,
+    /// A PEM file with the authorities of client certificates, whose names identify principals. `None`: clients have no
+    /// certificates.
+    pub client_ca: Option<PathBuf>,
+}
+
+/// The URL at which browsers reach the server behind a proxy: `http` or `https`, a host, and the path of a folder.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PublicUrl {
+    scheme: &'static str,
+    authority: String,
+    /// Empty, or begins with `/` and does not end with it.
+    path: String,
+}
+
+impl PublicUrl {
+    /// `http` or `https`.
+    pub const fn scheme(&self) -> &str {
+        self.scheme
+    }
+
+    /// The host and, unless it is that of the scheme, the port.
+    pub fn authority(&self) -> &str {
+        &self.authority
+    }
+
+    /// Empty, or a path that begins with `/` and does not end with it.
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+}
+
+impl std::str::FromStr for PublicUrl {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let expected = || format!("expected http://HOST/PATH or https://HOST/PATH, got '{text}'");
+        let (scheme, default_port, rest) = match text.split_once("://").ok_or_else(expected)? {
+            ("http", rest) => ("http", ":80", rest),
+            ("https", rest) => ("https", ":443", rest),
+            _ => return Err(expected()),
+        };
+        let (authority, path) = rest.split_at(rest.find('/').unwrap_or(rest.len()));
+        let authority = authority.strip_suffix(default_port).unwrap_or(authority).to_ascii_lowercase();
+        let is_host = |letter: char| letter.is_ascii_alphanumeric() || "-.:[]".contains(letter);
+        let is_path = |letter: char| letter.is_ascii_alphanumeric() || "/-._~".contains(letter);
+        let begins_with_host = authority.starts_with(|letter: char| letter.is_ascii_alphanumeric() || letter == '[');
+        if !begins_with_host || !authority.chars().all(is_host) || !path.chars().all(is_path) {
+            return Err(expected());
+        }
+        Ok(Self { scheme, authority, path: path.trim_end_matches('/').to_owned() })
+    }
+}
+
+impl std::fmt::Display for PublicUrl {
+    fn fmt(&self, out: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(out, "{}://{}{}", self.scheme, self.authority, self.path)
+    }
+}
+
 /// How the server finds the principals of calls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Authentication {
-    /// By the user of a Unix socket's client, or by a token.
+    /// By the user of a Unix socket's client, by a client certificate, or by a token.
     #[default]
     UsersAndTokens,
-    /// By a token, for machines on which several people share one account.
+    /// By a client certificate or a token, for machines on which several people share one account.
     Tokens,
     /// Every client is the owner.
     Off,
@@ -129,8 +209,14 @@ pub struct Config {
     pub authentication: Authentication,
     /// The file that names the principals besides the owner; see `modalcast::identity`.
     pub principals: Option<PathBuf>,
-    /// Whether addresses that other machines can connect to are allowed. Nothing that is sent there is encrypted.
+    /// Encryption of the TCP sockets. `None`: nothing is encrypted.
+    pub tls: Option<TlsSettings>,
+    /// Whether addresses that other machines can connect to are allowed without encryption.
     pub insecure: bool,
+    /// The URL at which browsers reach the server behind a proxy, besides the addresses of the server.
+    pub public_url: Option<PublicUrl>,
+    /// The address of health, readiness and metrics, which need no credential. `None`: there are none.
+    pub admin: Option<ListenAddress>,
     /// Whether browsers are served: the viewer and the WebSocket.
     pub viewer: bool,
     /// The recording that the viewer's page plays in place of the server's scenes.
@@ -221,8 +307,8 @@ pub struct Config {
     /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
     /// and then those that were idle for the longest time.
     pub connections: usize,
-    /// Time within which a new connection must send the preface of HTTP/2, which is 24 bytes, or the head of a request
-    /// in HTTP/1.1.
+    /// Time within which a new connection must complete its TLS handshake, and then the same time again, within which it
+    /// must send the preface of HTTP/2, which is 24 bytes, or the head of a request in HTTP/1.1.
     pub handshake_timeout: Duration,
     /// Time within which a connection must send its first request, from the preface of HTTP/2 or the handshake of a
     /// WebSocket on.
@@ -242,7 +328,10 @@ impl Default for Config {
             socket_permissions: SocketPermissions::default(),
             authentication: Authentication::default(),
             principals: None,
+            tls: None,
             insecure: false,
+            public_url: None,
+            admin: None,
             viewer: true,
             viewer_recording: None,
             scenes: None,
@@ -316,6 +405,25 @@ impl Config {
         self.state.join("token")
     }
 
+    /// Checks that tokens and data leave this machine only encrypted, or by name.
+    fn check_remote_addresses(&self) -> Result<()> {
+        if let Some(address) = self.listen.iter().find(|address| address.is_remote()) {
+            if self.authentication == Authentication::Off {
+                return Err(invalid("config.listen", "a loopback address without authentication", address));
+            }
+            if self.tls.is_none() && !self.insecure {
+                let expected = "a loopback address, TLS (--tls-self-signed or --tls-certificate), or --insecure to send \
+                                tokens and data without encryption";
+                return Err(invalid("config.listen", expected, address));
+            }
+        }
+        if let Some(address) = self.admin.iter().find(|address| address.is_remote() && !self.insecure) {
+            let expected = "a loopback address, or --insecure to let other machines read metrics without a credential";
+            return Err(invalid("config.admin", expected, address));
+        }
+        Ok(())
+    }
+
     /// Returns the configuration if every limit is in its range.
     ///
     /// # Errors
@@ -375,17 +483,7 @@ impl Config {
         if self.listen.is_empty() {
             return Err(invalid("config.listen", "at least one address", "none"));
         }
-        let is_remote =
-            |address: &ListenAddress| matches!(address, ListenAddress::Tcp(address) if !address.ip().is_loopback());
-        if let Some(address) = self.listen.iter().find(|address| is_remote(address)) {
-            if self.authentication == Authentication::Off {
-                return Err(invalid("config.listen", "a loopback address without authentication", address));
-            }
-            if !self.insecure {
-                let expected = "a loopback address, or --insecure to send tokens and data without encryption";
-                return Err(invalid("config.listen", expected, address));
-            }
-        }
+        self.check_remote_addresses()?;
         if self.state.as_os_str().is_empty() {
             return Err(invalid("config.state", "the path of a folder", "an empty path"));
         }
@@ -430,6 +528,51 @@ mod tests {
         for (field, config) in invalid_configs {
             let error = config.validated().expect_err(field).to_string();
             assert!(error.starts_with(field), "expected {field}, got {error}");
+        }
+    }
+
+    /// Tokens and data leave this machine only encrypted, or by name.
+    #[test]
+    fn remote_addresses_need_credentials_and_tls_or_insecure() {
+        let remote = |text: &str| vec![text.parse::<ListenAddress>().expect(text)];
+        let certificate = || ServerCertificate::SelfSigned { names: Vec::new() };
+        let tls = || Some(TlsSettings { certificate: certificate(), client_ca: None });
+        for address in ["0.0.0.0:1", "[::]:1", "192.0.2.1:1"] {
+            let config = || Config { listen: remote(address), ..Config::default() };
+            let error = config().validated().expect_err(address).to_string();
+            assert!(error.contains("--tls-self-signed") && error.contains("--insecure"), "{error}");
+            assert!(Config { tls: tls(), ..config() }.validated().is_ok());
+            assert!(Config { insecure: true, ..config() }.validated().is_ok());
+            let open = Config { tls: tls(), insecure: true, authentication: Authentication::Off, ..config() };
+            assert!(open.validated().is_err(), "expected no server without authentication at {address}");
+            let admin = || Config { tls: tls(), admin: remote(address).pop(), ..Config::default() };
+            assert!(admin().validated().is_err(), "expected no metrics at {address}");
+            assert!(Config { insecure: true, ..admin() }.validated().is_ok());
+        }
+    }
+
+    #[test]
+    fn public_url_has_a_scheme_a_host_and_a_path() {
+        for (text, shown) in [
+            ("https://lab.example", "https://lab.example"),
+            ("https://Lab.example:443/", "https://lab.example"),
+            ("http://lab.example:80/a/b/", "http://lab.example/a/b"),
+            ("https://lab.example:80", "https://lab.example:80"),
+            ("https://[2001:db8::1]:8443/a", "https://[2001:db8::1]:8443/a"),
+        ] {
+            assert_eq!(text.parse::<PublicUrl>().map(|url| url.to_string()).as_deref(), Ok(shown));
+        }
+        for text in [
+            "",
+            "lab.example",
+            "ftp://lab.example",
+            "https://",
+            "https:///a",
+            "https://a@b",
+            "https://a/?b",
+            "https://a;b",
+        ] {
+            assert!(text.parse::<PublicUrl>().is_err(), "{text}");
         }
     }
 

@@ -13,6 +13,7 @@ mod recording;
 mod render;
 mod serve;
 mod sibling;
+mod tls_options;
 mod token;
 mod view;
 
@@ -33,7 +34,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    Serve(serve::Args),
+    Serve(Box<serve::Args>),
     View(view::Args),
     Demo(demo::Args),
     Render(render::Args),

@@ -7,9 +7,10 @@ use std::time::Duration;
 
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use super::tls_options::TlsOptions;
 use super::{Completion, Outcome, print_line};
 use crate::config::{
-    Authentication, BackendChoice, Config, EncodeChoice, ListenAddress, RendererChoice, SocketPermissions,
+    Authentication, BackendChoice, Config, EncodeChoice, ListenAddress, PublicUrl, RendererChoice, SocketPermissions,
     ValidatedConfig, default_local_sockets,
 };
 use crate::engine::{Engine, EngineInfo};
@@ -22,7 +23,8 @@ use modalcast_model::load::{LoadOptions, SceneRepository};
 #[command(after_help = "Examples:
   modalcast serve                                   built-in scenes, for clients on this machine
   modalcast serve --scenes ~/scenes                 also the scenes of a folder
-  modalcast serve --listen 0.0.0.0:50051 --insecure also for clients on other machines, with the token
+  modalcast serve --listen 0.0.0.0:50051 --tls-self-signed
+                                                    also for clients on other machines, encrypted, with the token
   modalcast serve --listen unix:/run/user/1000/modalcast.sock
   modalcast serve --backend cpu --renderer software without a GPU")]
 pub(super) struct Args {
@@ -54,9 +56,18 @@ pub(super) struct Args {
     /// stop, change and delete everything.
     #[arg(long, conflicts_with_all = ["principals", "tokens_only"])]
     no_auth: bool,
-    /// Allow addresses that other machines can connect to. Tokens and data are not encrypted there.
+    #[command(flatten)]
+    tls: TlsOptions,
+    /// Allow addresses that other machines can connect to without encryption: everybody on the way can read tokens and data.
     #[arg(long)]
     insecure: bool,
+    /// URL at which browsers reach this server behind a proxy, such as https://lab.example/render. Its host and origin are
+    /// accepted, and the printed links begin with it.
+    #[arg(long, env = "MODALCAST_PUBLIC_URL", value_name = "URL")]
+    public_url: Option<PublicUrl>,
+    /// Address of health, readiness and metrics over HTTP, without credentials: IP:PORT or unix:PATH. Default: off.
+    #[arg(long, env = "MODALCAST_ADMIN", value_name = "ADDRESS")]
+    admin: Option<ListenAddress>,
     /// Do not serve browsers: neither the viewer nor the WebSocket.
     #[arg(long)]
     no_viewer: bool,
@@ -184,7 +195,10 @@ impl Args {
             socket_permissions: SocketPermissions { mode: self.socket_mode, group: self.socket_group },
             authentication: self.authentication(),
             principals: self.principals.clone(),
+            tls: self.tls.settings(),
             insecure: self.insecure,
+            public_url: self.public_url.clone(),
+            admin: self.admin.clone(),
             viewer: !self.no_viewer,
             scenes: self.scenes.clone(),
             load_options: LoadOptions { is_strict: self.strict, ..LoadOptions::default() },
@@ -294,19 +308,29 @@ fn log_authentication(config: &Config) {
     }
 }
 
-/// Prints the addresses, and links to the viewer. Warns about addresses that other machines can connect to.
+/// Prints the addresses, links to the viewer, and the certificate if it is self-signed. Warns about plain addresses that
+/// other machines can connect to.
 ///
 /// # Errors
 /// `Fault` when the system has no random numbers.
 pub(super) fn print_addresses(listener: &Listener) -> Result<()> {
-    for address in listener.remote_addresses() {
+    for address in listener.remote_addresses().filter(|_| !listener.is_encrypted()) {
         tracing::warn!("{address} accepts clients on other machines, and encrypts nothing");
     }
     for url in listener.urls() {
         print_line(format!("listening on {url}"));
     }
+    if let Some((file, fingerprint)) = listener.self_signed_certificate() {
+        print_line(format!("certificate {}, SHA-256 {fingerprint}", file.display()));
+    }
+    if let Some(url) = listener.admin_url() {
+        print_line(format!("health and metrics at {url}"));
+    }
     for link in listener.viewer_links()? {
         print_line(format!("viewer at {link}"));
+    }
+    for link in listener.remote_viewer_links()? {
+        print_line(format!("viewer from another machine at {link}"));
     }
     for command in tunnel_commands(listener) {
         print_line(format!("viewer from another machine: run '{command}' there, then open this URL"));
@@ -315,8 +339,11 @@ pub(super) fn print_addresses(listener: &Listener) -> Result<()> {
 }
 
 /// The commands that make the viewer available on another machine through SSH. There are none unless the user has
-/// logged in through SSH, or the server accepts clients of other machines.
+/// logged in through SSH, or the server accepts clients of other machines without encryption.
 fn tunnel_commands(listener: &Listener) -> Vec<String> {
+    if !listener.remote_viewer_urls().is_empty() {
+        return Vec::new();
+    }
     let ssh_address = std::env::var("SSH_CONNECTION").ok().and_then(|text| server_of_ssh_connection(&text));
     if ssh_address.is_none() && listener.remote_addresses().next().is_none() {
         return Vec::new();

@@ -15,6 +15,7 @@ use super::loading_options::LoadingOptions;
 use super::modeling_options::ModelingOptions;
 use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
+use super::tls_options::TlsOptions;
 use super::{Completion, Outcome, print_line, recording};
 use crate::config::{
     BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording, default_local_sockets,
@@ -40,7 +41,7 @@ const PHYSICS_PROGRAM: &str = "modalcast-sim";
   modalcast view part.msh --unit mm                 a volume mesh, whose modes are computed
   modalcast view fork.npz --slow 500                pulled, and seen in slower motion than by default
   modalcast view tree.mcap                          plays a recording
-  modalcast view model.glb --listen 0.0.0.0:50051 --insecure   also for browsers on other machines")]
+  modalcast view model.glb --listen 0.0.0.0:50051 --tls-self-signed   also for browsers on other machines")]
 pub(super) struct Args {
     /// A built-in name, a folder with scene.toml, a .glb, .gltf, .obj, .ply, .stl, .npz or
     /// .structure.json file, a folder with one model, a volume mesh (.msh, .vtk, .vtu or .veg), whose modes are
@@ -49,7 +50,10 @@ pub(super) struct Args {
     /// Address to listen on: IP:PORT, where port 0 selects a free port.
     #[arg(long, default_value_t = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0))]
     listen: SocketAddr,
-    /// Allow an address that other machines can connect to. Tokens and data are not encrypted there.
+    #[command(flatten)]
+    tls: TlsOptions,
+    /// Allow an address that other machines can connect to without encryption: everybody on the way can read tokens and
+    /// data.
     #[arg(long)]
     insecure: bool,
     /// Print the URL and do not open a browser.
@@ -111,6 +115,7 @@ impl Args {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
             local_sockets: Some(default_local_sockets()),
+            tls: self.tls.settings(),
             insecure: self.insecure,
             scenes: location.repository.clone(),
             load_options: self.load_options(),
@@ -127,6 +132,7 @@ impl Args {
         Config {
             listen: vec![ListenAddress::Tcp(self.listen)],
             local_sockets: Some(default_local_sockets()),
+            tls: self.tls.settings(),
             insecure: self.insecure,
             viewer_recording: Some(ViewerRecording {
                 file: recording::read(&self.model)?,
@@ -256,7 +262,7 @@ fn start_physics(
     listener: &Listener,
     scene: &str,
 ) -> Result<PhysicsProcess> {
-    let server = listener.local_urls().into_iter().next().ok_or_else(|| fault("view", "expected an address"))?;
+    let server = listener.program_url().ok_or_else(|| fault("view", "expected an address"))?.to_owned();
     let slow = slow.map_or_else(|| "auto".to_owned(), |factor| factor.to_string());
     let mut flags = vec!["--server".to_owned(), server, "--scene".into(), scene.into(), "--slow".into(), slow];
     flags.extend(["--wait", "30", "--seconds", "0", "--realtime", "--forces", "--delivery", "latest"].map(Into::into));

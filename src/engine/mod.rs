@@ -70,6 +70,7 @@ pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;
 pub use scene::step_queue::{Overflow, StepReport};
 pub use scene::subscriber::Subscription;
+pub use scene_memory::MemoryUse;
 pub use source::{SceneSource, StoredUpload};
 pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
 pub use storage::provenance::{SceneProvenance, validate_scene_name};
@@ -241,6 +242,11 @@ impl Engine {
     /// Whether every scene of the last run is open or has failed.
     pub fn watch_reopening(&self) -> watch::Receiver<bool> {
         self.shared.are_scenes_reopened.subscribe()
+    }
+
+    /// The memory of all scenes, by its kind: `host` and, with a GPU, `device`.
+    pub fn memory_use(&self) -> impl Iterator<Item = (&'static str, MemoryUse)> {
+        self.shared.memory.in_use()
     }
 
     /// Whether the last steps cannot be written to disk. The scenes continue.

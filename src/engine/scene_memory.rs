@@ -23,6 +23,13 @@ pub(super) struct MemoryBudgets {
     has_renderer: bool,
 }
 
+/// Memory of all scenes in bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct MemoryUse {
+    pub reserved: u64,
+    pub limit: u64,
+}
+
 /// The reserved memory of one scene, until this is dropped.
 #[derive(Debug)]
 pub(super) struct SceneMemory {
@@ -37,6 +44,12 @@ impl MemoryBudgets {
     pub(super) fn new(limits: MemoryLimits, has_renderer: bool) -> Self {
         let has_device = limits.has_device;
         Self { host: limits.host_budget(), device: limits.device_budget(), has_device, has_renderer }
+    }
+
+    /// The memory of all scenes, by its kind. Without a device, what scenes have there counts as host memory.
+    pub(super) fn in_use(&self) -> impl Iterator<Item = (&'static str, MemoryUse)> {
+        let budgets = [("host", &self.host)].into_iter().chain(self.has_device.then_some(("device", &self.device)));
+        budgets.map(|(kind, budget)| (kind, MemoryUse { reserved: budget.reserved(), limit: budget.total() }))
     }
 
     /// The memory of a scene that is to be loaded.

@@ -1,6 +1,7 @@
-//! Accepts connections under a limit. Serves gRPC on those that begin with the preface of HTTP/2, and the browser
-//! viewer on the others. A connection that does not send its first bytes or its first request in time is closed. The
-//! listener pauses after a failed accept, so that it does not spin when file descriptors run out.
+//! Accepts connections under a limit, and encrypts those of TCP if the server has a certificate. Serves gRPC on those that
+//! begin with the preface of HTTP/2, and the browser viewer on the others. A connection that does not complete its TLS
+//! handshake, or does not send its first bytes or its first request, in time is closed. The listener pauses after a failed
+//! accept, so that it does not spin when file descriptors run out.
 
 use std::convert::Infallible;
 use std::io;
@@ -17,16 +18,18 @@ use tonic::codegen::http::{Request, Response};
 
 use super::authentication::Authenticator;
 use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
+use super::connection_gauges::ConnectionGauges;
 use super::connection_table::{ConnectionSlot, ConnectionTable, GOAWAY_TIMEOUT};
 use super::control_frames::ControlFrameLimit;
 use super::listen::{ListeningSockets, Peer, Socket};
 use super::metered_socket::MeteredSocket;
 use super::routes::Routes;
+use super::tls::TlsServer;
 use super::web::WebServer;
 use crate::config::Config;
 
 /// Pause of the listener after a failed accept.
-const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
+pub(super) const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(50);
 
 /// Limit on the open calls of one connection. All of them are handled at a time. No call waits in a queue: HTTP/2 would
 /// buffer up to one stream window of a waiting call outside the budgets.
@@ -42,6 +45,9 @@ pub(super) struct ConnectionServer {
     web: Option<WebServer>,
     http2: http2::Builder<TokioExecutor>,
     authenticator: Arc<Authenticator>,
+    /// Encrypts TCP connections. `None`: they are plain.
+    tls: Option<Arc<TlsServer>>,
+    connections: ConnectionGauges,
     budgets: Budgets,
     handshake_timeout: Duration,
     first_request_timeout: Duration,
@@ -52,11 +58,15 @@ impl ConnectionServer {
         routes: Routes,
         web: Option<WebServer>,
         authenticator: Arc<Authenticator>,
+        tls: Option<Arc<TlsServer>>,
+        connections: ConnectionGauges,
         config: &Config,
     ) -> Arc<Self> {
         Arc::new(Self {
             routes,
             authenticator,
+            tls,
+            connections,
             web,
             http2: http2_builder(config),
             budgets: Budgets::new(config),
@@ -91,21 +101,42 @@ impl ConnectionServer {
         }
     }
 
-    async fn serve_until_retired(&self, mut socket: Socket, peer: Peer, slot: &ConnectionSlot) {
+    async fn serve_until_retired(&self, socket: Socket, peer: Peer, slot: &ConnectionSlot) {
+        let Some(mut socket) = self.encrypt(socket, &peer).await else { return };
         let protocol = tokio::time::timeout(self.handshake_timeout, detect_protocol(&mut socket));
         let Ok(Ok(Some(protocol))) = protocol.await else { return };
         let info_with = |credential| ConnectionInfo::new(&peer.name, credential, &self.budgets, slot);
         match (protocol, &self.web) {
             (Protocol::Http2, _) => {
-                let credential = self.authenticator.credential_of_connection(peer.uid);
+                let _counted = self.connections.count("grpc");
+                let credential = self.authenticator.credential_of_connection(peer.uid, &socket.client_names());
                 self.serve_http2(socket, &info_with(credential), slot).await;
             }
             (Protocol::Other(first_bytes), Some(web)) => {
+                let _counted = self.connections.count("http");
                 // Browsers send the token of their session in a message.
-                let credential = self.authenticator.credential_of_connection(peer.uid);
+                let credential = self.authenticator.credential_of_connection(peer.uid, &socket.client_names());
                 web.serve(socket, first_bytes, info_with(credential), slot).await;
             }
             (Protocol::Other(_), None) => {}
+        }
+    }
+
+    /// Makes a TLS connection of a TCP connection if the server has a certificate. `None` if the handshake fails or takes too
+    /// long. The table bounds the number of handshakes: connections in one have sent no request, and are closed first when
+    /// the table is full.
+    async fn encrypt(&self, socket: Socket, peer: &Peer) -> Option<Socket> {
+        let (tls, stream) = match (&self.tls, socket) {
+            (Some(tls), Socket::Tcp(stream)) => (tls, stream),
+            (_, socket) => return Some(socket),
+        };
+        match tokio::time::timeout(self.handshake_timeout, tls.accept(stream)).await {
+            Ok(Ok(socket)) => Some(Socket::Tls(socket)),
+            Ok(Err(error)) => {
+                tracing::info!(peer = peer.name, %error, "a TLS handshake failed");
+                None
+            }
+            Err(_) => None,
         }
     }
 

@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use prometheus_client::metrics::counter::Counter;
 use tonic::Status;
 use tonic::codegen::http::{HeaderMap, header};
 
@@ -11,7 +12,7 @@ use super::permissions::{Requirement, requirement_of};
 use super::status::{to_status, unauthenticated, unknown_method};
 use crate::config::{Authentication, Config};
 use crate::engine::lock;
-use crate::identity::{Credential, Directory};
+use crate::identity::{CertificateName, Credential, Directory};
 use modalcast_model::error::{Error, Result};
 
 /// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
@@ -27,6 +28,8 @@ pub(super) struct Authenticator {
     directory: Arc<Directory>,
     authentication: Authentication,
     rejections: Mutex<Rejections>,
+    /// All rejected calls.
+    failures: Counter,
 }
 
 /// Rejected calls since the last log record.
@@ -50,20 +53,31 @@ impl Authenticator {
     pub(super) fn new(config: &Config) -> Result<Arc<Self>> {
         let directory = Directory::open(&config.token_file(), config.principals.as_deref())?;
         let authentication = config.authentication;
-        Ok(Arc::new(Self { directory: Arc::new(directory), authentication, rejections: Mutex::default() }))
+        let (rejections, failures) = (Mutex::default(), Counter::default());
+        Ok(Arc::new(Self { directory: Arc::new(directory), authentication, rejections, failures }))
     }
 
     pub(super) fn directory(&self) -> &Arc<Directory> {
         &self.directory
     }
 
-    /// The credential of a connection itself. `uid` is the user of a Unix socket's client. Calls without a token use
-    /// it.
-    pub(super) fn credential_of_connection(&self, uid: Option<u32>) -> Option<Arc<Credential>> {
+    /// The number of rejected calls.
+    pub(super) const fn failures(&self) -> &Counter {
+        &self.failures
+    }
+
+    /// The credential of a connection itself, which calls without a token use. `uid` is the user of a Unix socket's client,
+    /// and `certificate_names` are those of a client certificate.
+    pub(super) fn credential_of_connection(
+        &self,
+        uid: Option<u32>,
+        certificate_names: &[CertificateName],
+    ) -> Option<Arc<Credential>> {
+        let of_certificate = || self.directory.find_certificate(certificate_names);
         match self.authentication {
             Authentication::Off => Some(Arc::clone(self.directory.owner())),
-            Authentication::UsersAndTokens => self.directory.find_uid(uid?),
-            Authentication::Tokens => None,
+            Authentication::UsersAndTokens => of_certificate().or_else(|| self.directory.find_uid(uid?)),
+            Authentication::Tokens => of_certificate(),
         }
     }
 
@@ -105,8 +119,9 @@ impl Authenticator {
             ..self.deny(unauthenticated("a token that this server knows", "another token"), peer)
         };
         let Some(credential) = of_call.map_err(wrong_token)?.filter(|credential| !credential.is_revoked()) else {
-            let expected = "a token, or the server's Unix socket and a user whom the server knows";
-            return Err(self.deny(unauthenticated(expected, "neither"), peer));
+            let expected =
+                "a token, a client certificate, or the server's Unix socket, of a user whom the server knows";
+            return Err(self.deny(unauthenticated(expected, "none of them"), peer));
         };
         let principal = credential.principal();
         if principal.role < role {
@@ -133,6 +148,7 @@ impl Authenticator {
 
     /// Denies a call, and logs the denials of each [`LOG_INTERVAL`] in one record.
     fn deny(&self, status: Status, peer: &str) -> Denial {
+        self.failures.inc();
         let mut rejections = lock(&self.rejections);
         rejections.count += 1;
         if rejections.last_record.is_none_or(|last_record| last_record.elapsed() >= LOG_INTERVAL) {

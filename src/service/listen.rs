@@ -13,7 +13,9 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
 use super::authentication::Authenticator;
-use crate::config::{Config, ListenAddress, SocketPermissions};
+use super::tls::{TlsServer, TlsSocket};
+use crate::config::{Config, ListenAddress, PublicUrl, SocketPermissions};
+use crate::identity::CertificateName;
 use modalcast_model::error::{Error, Result};
 
 /// Bound sockets, and the credentials of their clients. Dropping it removes the files of the Unix sockets.
@@ -29,6 +31,12 @@ pub struct Listener {
     addresses: Vec<SocketAddr>,
     has_viewer: bool,
     pub(super) authenticator: Arc<Authenticator>,
+    /// Encrypts the TCP sockets. `None`: they are plain.
+    pub(super) tls: Option<Arc<TlsServer>>,
+    pub(super) public_url: Option<PublicUrl>,
+    /// The socket of health and metrics, if it is on.
+    pub(super) admin: Option<ListeningSockets>,
+    admin_url: Option<String>,
 }
 
 /// The sockets of a listener.
@@ -54,6 +62,7 @@ pub(super) struct Peer {
 #[derive(Debug)]
 pub(super) enum Socket {
     Tcp(TcpStream),
+    Tls(TlsSocket),
     Unix(UnixStream),
 }
 
@@ -62,7 +71,8 @@ impl Listener {
     ///
     /// # Errors
     /// `Unavailable` when an address is in use, does not belong to this machine, or cannot be created; `InvalidFile` for
-    /// the file of principals; `Fault` when the system has no random numbers.
+    /// the file of principals, and for certificates; `Invalid` for names of certificates; `Fault` when the system has no
+    /// random numbers.
     pub(super) async fn bind(config: &Config) -> Result<Self> {
         let mut listener = Self {
             sockets: ListeningSockets::default(),
@@ -72,12 +82,26 @@ impl Listener {
             addresses: Vec::new(),
             has_viewer: config.viewer,
             authenticator: Authenticator::new(config)?,
+            tls: None,
+            public_url: config.public_url.clone(),
+            admin: None,
+            admin_url: None,
         };
+        if let Some(settings) = &config.tls {
+            listener.tls = Some(TlsServer::open(settings, config, own_names(&config.listen))?);
+        }
         for address in &config.listen {
             listener.add(address, config.socket_permissions).await.map_err(|error| Error::Unavailable {
                 what: "listening address",
                 reason: format!("{address}: {error}"),
                 remedy: "Set another address with --listen".into(),
+            })?;
+        }
+        if let Some(address) = &config.admin {
+            listener.add_admin(address).await.map_err(|error| Error::Unavailable {
+                what: "address of health and metrics",
+                reason: format!("{address}: {error}"),
+                remedy: "Set another address with --admin".into(),
             })?;
         }
         if let Some(folder) = &config.local_sockets {
@@ -122,26 +146,51 @@ impl Listener {
     }
 
     async fn add(&mut self, address: &ListenAddress, permissions: SocketPermissions) -> io::Result<()> {
-        let socket = match address {
-            ListenAddress::Tcp(address) => {
-                let socket = TcpListener::bind(address).await?;
-                let bound_address = socket.local_addr()?;
-                self.urls.push(format!("http://{bound_address}"));
+        let (socket, file) = bind(address, permissions).await?;
+        self.files.extend(file);
+        match &socket {
+            ListeningSocket::Tcp(listener) => {
+                let bound_address = listener.local_addr()?;
+                self.urls.push(format!("{}://{bound_address}", self.scheme()));
                 self.addresses.push(bound_address);
-                ListeningSocket::Tcp(socket)
             }
-            ListenAddress::Unix(path) => {
-                let (socket, file) = SocketFile::bind(path, permissions)?;
-                self.urls.push(address.to_string());
-                self.files.push(file);
-                ListeningSocket::Unix(socket)
-            }
-        };
+            ListeningSocket::Unix(_) => self.urls.push(address.to_string()),
+        }
         self.sockets.0.push(socket);
         Ok(())
     }
 
-    /// The URLs for clients, in the order of the addresses: `http://IP:PORT` or `unix:PATH`.
+    async fn add_admin(&mut self, address: &ListenAddress) -> io::Result<()> {
+        let (socket, file) = bind(address, SocketPermissions::default()).await?;
+        self.files.extend(file);
+        self.admin_url = Some(match &socket {
+            ListeningSocket::Tcp(listener) => format!("http://{}", listener.local_addr()?),
+            ListeningSocket::Unix(_) => address.to_string(),
+        });
+        self.admin = Some(ListeningSockets(vec![socket]));
+        Ok(())
+    }
+
+    const fn scheme(&self) -> &'static str {
+        if self.tls.is_some() { "https" } else { "http" }
+    }
+
+    /// The URL of health and metrics: `http://IP:PORT` or `unix:PATH`. `None` if they are off.
+    pub fn admin_url(&self) -> Option<&str> {
+        self.admin_url.as_deref()
+    }
+
+    /// Whether the TCP sockets are encrypted.
+    pub const fn is_encrypted(&self) -> bool {
+        self.tls.is_some()
+    }
+
+    /// The file and the SHA-256 of a self-signed certificate. `None` without one.
+    pub fn self_signed_certificate(&self) -> Option<(&Path, Arc<str>)> {
+        self.tls.as_ref()?.self_signed_certificate()
+    }
+
+    /// The URLs for clients, in the order of the addresses: `http://IP:PORT`, `https://IP:PORT` or `unix:PATH`.
     pub fn urls(&self) -> &[String] {
         &self.urls
     }
@@ -151,20 +200,40 @@ impl Listener {
         self.addresses.iter().copied().filter(|address| !address.ip().is_loopback())
     }
 
-    /// New links to the viewer for the user of the server, in the order of the addresses. Each is valid once, in a browser
-    /// on this machine. Empty if the viewer is off.
+    /// New links to the viewer for the user of the server: at the public URL, and in browsers on this machine, in the order
+    /// of the addresses. Each is valid once. Empty if the viewer is off.
     ///
     /// # Errors
     /// `Fault` when the system has no random numbers.
     pub fn viewer_links(&self) -> Result<Vec<String>> {
-        let addresses = self.viewer_addresses();
-        let owner = self.authenticator.directory().owner();
-        addresses.map(|address| Ok(format!("http://{address}{}", self.authenticator.viewer_url_path(owner)?))).collect()
+        let public_url = self.public_url.iter().filter(|_| self.has_viewer).map(ToString::to_string);
+        let local_urls = self.viewer_addresses().map(|address| format!("{}://{address}", self.scheme()));
+        public_url.chain(local_urls).map(|url| self.viewer_link(&url)).collect()
     }
 
-    /// The URLs at which programs on this machine reach the TCP sockets, in the order of the addresses.
-    pub fn local_urls(&self) -> Vec<String> {
-        self.addresses.iter().map(|address| format!("http://{}", local_address(*address))).collect()
+    fn viewer_link(&self, url: &str) -> Result<String> {
+        Ok(url.to_owned() + &self.authenticator.viewer_url_path(self.authenticator.directory().owner())?)
+    }
+
+    /// New links to the viewer for browsers on other machines, without those of the public URL. Empty if the viewer is off,
+    /// or the server encrypts nothing.
+    ///
+    /// # Errors
+    /// `Fault` when the system has no random numbers.
+    pub fn remote_viewer_links(&self) -> Result<Vec<String>> {
+        let host = |address: SocketAddr| match address.ip().is_unspecified() {
+            true => format!("{}:{}", host_name().unwrap_or_else(|| "HOST".into()), address.port()),
+            false => address.to_string(),
+        };
+        let is_offered = self.has_viewer && self.is_encrypted();
+        let addresses = self.remote_addresses().filter(|_| is_offered);
+        addresses.map(|address| self.viewer_link(&format!("https://{}", host(address)))).collect()
+    }
+
+    /// The URL at which programs of this user reach the server: a Unix socket or, without one, a TCP socket.
+    pub fn program_url(&self) -> Option<&str> {
+        let unix = self.urls.iter().find(|url| url.starts_with("unix:"));
+        unix.or_else(|| self.urls.first()).map(String::as_str)
     }
 
     /// The addresses in the viewer's URLs.
@@ -183,9 +252,44 @@ fn local_address(address: SocketAddr) -> SocketAddr {
     SocketAddr::new(ip, address.port())
 }
 
+/// The names and addresses of this machine in the certificate of a server with these addresses. If it accepts clients of
+/// other machines, also those by which they reach it.
+fn own_names(listen: &[ListenAddress]) -> BTreeSet<String> {
+    let mut names: BTreeSet<String> = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
+    let tcp_ip = |address: &ListenAddress| match address {
+        ListenAddress::Tcp(address) => Some(address.ip()).filter(|ip| !ip.is_unspecified()),
+        ListenAddress::Unix(_) => None,
+    };
+    names.extend(listen.iter().filter_map(tcp_ip).map(|ip| ip.to_string()));
+    if listen.iter().any(ListenAddress::is_remote) {
+        names.extend(host_name());
+        // The own addresses of routes to documentation addresses, to which nothing is sent (RFC 5737, RFC 3849).
+        let routes = [("0.0.0.0:0", "192.0.2.1:9"), ("[::]:0", "[2001:db8::1]:9")];
+        names.extend(routes.iter().filter_map(|(own, other)| {
+            let socket = std::net::UdpSocket::bind(own).ok()?;
+            socket.connect(other).ok()?;
+            Some(socket.local_addr().ok()?.ip().to_string())
+        }));
+    }
+    names
+}
+
 /// The name of this machine.
 pub fn host_name() -> Option<String> {
     rustix::system::uname().nodename().to_str().ok().filter(|name| !name.is_empty()).map(str::to_owned)
+}
+
+/// Binds a socket. A Unix socket has a file.
+async fn bind(
+    address: &ListenAddress,
+    permissions: SocketPermissions,
+) -> io::Result<(ListeningSocket, Option<SocketFile>)> {
+    match address {
+        ListenAddress::Tcp(address) => Ok((ListeningSocket::Tcp(TcpListener::bind(address).await?), None)),
+        ListenAddress::Unix(path) => {
+            SocketFile::bind(path, permissions).map(|(socket, file)| (ListeningSocket::Unix(socket), Some(file)))
+        }
+    }
 }
 
 impl ListeningSockets {
@@ -299,15 +403,34 @@ impl Socket {
     fn io(&mut self) -> Pin<&mut dyn Io> {
         match self {
             Self::Tcp(stream) => Pin::new(stream),
+            Self::Tls(socket) => Pin::new(socket),
             Self::Unix(stream) => Pin::new(stream),
         }
     }
 
     /// The IP address at which the connection arrived. `None` for a Unix socket.
     pub(super) fn local_ip(&self) -> Option<IpAddr> {
+        let stream = match self {
+            Self::Tcp(stream) => stream,
+            Self::Tls(socket) => socket.tcp(),
+            Self::Unix(_) => return None,
+        };
+        stream.local_addr().ok().map(|address| address.ip().to_canonical())
+    }
+
+    /// The names of the client's certificate. Empty without one.
+    pub(super) fn client_names(&self) -> Vec<CertificateName> {
         match self {
-            Self::Tcp(stream) => stream.local_addr().ok().map(|address| address.ip().to_canonical()),
-            Self::Unix(_) => None,
+            Self::Tls(socket) => socket.client_names(),
+            Self::Tcp(_) | Self::Unix(_) => Vec::new(),
+        }
+    }
+
+    /// The names of the server's certificate. `None` without encryption.
+    pub(super) fn certificate_names(&self) -> Option<Arc<[String]>> {
+        match self {
+            Self::Tls(socket) => Some(Arc::clone(&socket.host_names)),
+            Self::Tcp(_) | Self::Unix(_) => None,
         }
     }
 }
@@ -334,6 +457,7 @@ impl AsyncWrite for Socket {
     fn is_write_vectored(&self) -> bool {
         match self {
             Self::Tcp(stream) => stream.is_write_vectored(),
+            Self::Tls(socket) => socket.is_write_vectored(),
             Self::Unix(stream) => stream.is_write_vectored(),
         }
     }
@@ -395,6 +519,20 @@ mod tests {
         std::fs::set_permissions(&sockets, std::fs::Permissions::from_mode(0o777)).expect("expected new permissions");
         let listener = Listener::bind(&config).await.expect("expected a server without the socket");
         assert_eq!(listener.urls().len(), 1);
+    }
+
+    /// Clients compare the name or address in their URL with the certificate.
+    #[test]
+    fn certificate_has_the_addresses_that_the_server_listens_on() {
+        let names = |addresses: &[&str]| {
+            let listen: Vec<ListenAddress> = addresses.iter().map(|text| text.parse().expect(text)).collect();
+            own_names(&listen)
+        };
+        let local = names(&["127.0.0.1:1", "unix:/run/modalcast.sock"]);
+        assert_eq!(local.iter().map(String::as_str).collect::<Vec<_>>(), ["127.0.0.1", "::1", "localhost"]);
+        let remote = names(&["0.0.0.0:1", "192.0.2.7:1"]);
+        assert!(remote.contains("192.0.2.7") && !remote.contains("0.0.0.0"), "{remote:?}");
+        assert!(host_name().is_none_or(|name| remote.contains(&name)));
     }
 
     /// A server that was replaced does not remove the socket of its successor.

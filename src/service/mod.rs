@@ -2,9 +2,11 @@
 //! protobuf types.
 
 mod accept;
+mod admin;
 mod authentication;
 mod caller;
 mod connection;
+mod connection_gauges;
 mod connection_table;
 mod control_frames;
 mod convert;
@@ -32,6 +34,7 @@ mod status;
 mod step_parts;
 mod steps;
 mod stream;
+mod tls;
 mod uploads;
 mod vertices;
 mod web;
@@ -41,16 +44,20 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use modalcast_proto::v1;
+use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tonic_health::server::HealthReporter;
 
 pub use self::listen::{Listener, host_name};
 
 use self::accept::ConnectionServer;
+use self::admin::AdminServer;
 use self::authentication::Authenticator;
+use self::connection_gauges::ConnectionGauges;
 use self::connection_table::ConnectionTable;
 use self::routes::Routes;
 use self::shared_memory::SharedMemory;
+use self::tls::TlsServer;
 use self::web::{Access, WebServer};
 use crate::config::Config;
 use crate::engine::Engine;
@@ -88,12 +95,23 @@ pub async fn serve(
     let routes = routes(&engine, &config, &shared_memory, &authenticator)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
     let web = config.viewer.then(|| {
-        let access = Access::new(host_name().filter(|_| accepts_machines));
+        let host_name = host_name().filter(|_| accepts_machines);
+        let access = Access::new(host_name, listener.public_url.clone());
         WebServer::new(routes.clone(), access, &authenticator, Arc::clone(&health.is_serving), &config)
     });
-    let connection_server = ConnectionServer::new(routes, web.transpose()?, Arc::clone(&authenticator), &config);
+    let web = web.transpose()?;
     // The files are removed when this function returns.
-    let Listener { sockets, shared_memory: shared_memory_socket, files: _files, .. } = listener;
+    let Listener { sockets, shared_memory: shared_memory_socket, files: _files, tls, admin, .. } = listener;
+    let connections = ConnectionGauges::default();
+    // Its tasks end when this function returns.
+    let mut admin_tasks = JoinSet::new();
+    if let Some(sockets) = admin {
+        let (is_serving, failures) = (Arc::clone(&health.is_serving), authenticator.failures().clone());
+        let admin_server = AdminServer::new(engine.clone(), is_serving, &connections, failures);
+        admin_tasks.spawn(admin_server.accept_connections(sockets));
+    }
+    let connection_server =
+        ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config);
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
     let table = ConnectionTable::new(config.connections);
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
@@ -116,12 +134,21 @@ pub async fn serve(
         () = accept_connections => return Ok(()),
         () = report_state => return Ok(()),
         () = authenticator.directory().keep_fresh() => return Ok(()),
+        () = keep_certificate_fresh(tls.as_deref()) => return Ok(()),
         stopped = stop_engine => stopped,
     };
     if tokio::time::timeout_at(drain_deadline, table.retire_all()).await.is_err() {
         tracing::warn!("some clients did not close their connections within the drain time");
     }
     loss.map_or(Ok(()), Err)
+}
+
+/// Keeps the certificate up to date. Waits forever without one.
+async fn keep_certificate_fresh(tls: Option<&TlsServer>) {
+    match tls {
+        Some(tls) => tls.keep_fresh().await,
+        None => std::future::pending().await,
+    }
 }
 
 /// Time between the loss of the device and the end of the server, in which health checks report the loss.

@@ -1,5 +1,6 @@
 //! Tests that need no GPU, in one binary. The tests that render need an EGL driver; a software driver is enough.
 
+mod admin;
 mod array_uploads;
 mod attribute_streams;
 mod broken_streams;
@@ -54,6 +55,7 @@ mod steps;
 mod storages;
 mod stream_settings;
 mod streams;
+mod tls;
 mod tolerance;
 mod unix_sockets;
 mod viewer_port;

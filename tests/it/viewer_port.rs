@@ -87,6 +87,32 @@ async fn page_needs_own_host() {
     assert_eq!(exchange(&server, no_host).await.expect("expected an answer").status, 403);
 }
 
+/// A proxy keeps the public host and path, or replaces them.
+#[tokio::test(flavor = "multi_thread")]
+async fn page_is_served_behind_a_proxy() {
+    let public_url = || Some("https://lab.example/render".parse().expect("expected a URL"));
+    let server = Server::start_with(|config| Config { public_url: public_url(), ..config }).await;
+    let own = authority(&server);
+    for (path, host) in
+        [("/render/", "lab.example"), ("/", "lab.example"), ("/render/", own), ("/", own), ("/render", "lab.example")]
+    {
+        let page = get(&server, path, host, "Origin: https://lab.example\r\n").await;
+        assert_eq!(page.status, 200, "{path} {host}");
+        let own = if host == own { format!("ws://{own} ") } else { String::new() };
+        assert!(page.head.contains(&format!("connect-src 'self' {own}wss://lab.example;")), "{}", page.head);
+    }
+    for (path, host) in [("/rendering/", "lab.example"), ("/render/render/", "lab.example")] {
+        assert_eq!(get(&server, path, host, "").await.status, 404, "{path}");
+    }
+    let page_path = "/render/";
+    assert_eq!(get(&server, page_path, "evil.example", "").await.status, 403);
+    assert_eq!(get(&server, page_path, "lab.example", "Origin: http://lab.example\r\n").await.status, 403);
+    // Control: the same requests without the option.
+    let server = Server::start_with(|config| config).await;
+    assert_eq!(get(&server, "/", "lab.example", "").await.status, 403);
+    assert_eq!(get(&server, page_path, "localhost", "").await.status, 404);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn websocket_needs_origin_and_subprotocol() {
     let server = Server::start_with(|config| config).await;

@@ -6,6 +6,7 @@ use bytes::Bytes;
 use futures_util::{SinkExt as _, StreamExt as _};
 use http_body_util::{BodyExt as _, Full};
 use prost::Message as _;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest as _;
@@ -28,7 +29,7 @@ pub(crate) const STATUS: u8 = 5;
 
 /// Host and port of a server, as text.
 pub(crate) fn authority(server: &Server) -> &str {
-    server.address.trim_start_matches("http://")
+    server.address.split_once("://").map_or("", |(_, authority)| authority)
 }
 
 /// A message of the server.
@@ -217,11 +218,11 @@ fn envelope(id: u32, kind: u8, payload: &[u8]) -> Vec<u8> {
 }
 
 /// Makes the handshake of a WebSocket with further headers.
-pub(crate) async fn handshake(
-    socket: TcpStream,
+pub(crate) async fn handshake<S: AsyncRead + AsyncWrite + Unpin>(
+    socket: S,
     server: &Server,
     headers: &[(&'static str, &str)],
-) -> Result<WebSocketStream<TcpStream>, WebSocketError> {
+) -> Result<WebSocketStream<S>, WebSocketError> {
     let url = format!("ws://{}/websocket", authority(server));
     let mut request = url.into_client_request().expect("expected a valid request");
     request.headers_mut().insert("sec-websocket-protocol", "modalcast.v1".parse().expect("expected a header"));

@@ -90,13 +90,14 @@ impl ServerInfo {
 
 impl Client {
     /// Connects, with a timeout of five seconds, and checks that the server has the protocol version of this client.
-    /// `url` is `https://host:port`, `http://host:port`, `host:port` (plain), or `unix:path` for a Unix socket. A server of this user on this machine
-    /// is reached at its Unix socket, which needs no token. For others, set a token by [`Self::connect_with`], or the
-    /// environment variable `MODALCAST_TOKEN_FILE` to the path of a file with a token.
+    /// `url` is `https://host:port`, `http://host:port`, `host:port` (plain), or `unix:path` for a Unix socket. A plain
+    /// server of this user on this machine is reached at its Unix socket, which needs no token. For others, set a token
+    /// by [`Self::connect_with`], or the environment variable `MODALCAST_TOKEN_FILE` to the path of a file with a token.
     ///
     /// # Errors
-    /// `Connect` if the URL is invalid or no server answers; `Certificate` if that of the server is not accepted; `ProtocolVersion` if the server has another version;
-    /// `Status` if the server is not a modalcast server, or does not know the caller.
+    /// `Connect` if the URL is invalid or no server answers; `Certificate` if that of the server is not accepted;
+    /// `ProtocolVersion` if the server has another version; `Status` if the server is not a modalcast server, or does not
+    /// know the caller.
     pub async fn connect(url: &str) -> Result<Self> {
         Self::connect_with(url, &ConnectOptions::default()).await
     }

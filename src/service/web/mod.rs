@@ -13,7 +13,6 @@ mod reply_messages;
 mod websocket;
 
 use std::convert::Infallible;
-use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -30,7 +29,7 @@ use tonic::codegen::http::{Method, Request, Response, StatusCode};
 
 pub(super) use self::access::Access;
 
-use self::access::Denied;
+use self::access::{Arrival, Denied};
 use self::page::Page;
 use self::websocket::{WebSocketLimits, serve_websocket};
 use super::authentication::{Authenticator, WRONG_TOKEN_DELAY, bearer_token};
@@ -120,10 +119,10 @@ impl WebServer {
         info: &ConnectionInfo,
         slot: &ConnectionSlot,
     ) -> Option<OnUpgrade> {
-        let local_ip = socket.local_ip();
+        let arrival = Arrival::of(&socket);
         let upgrade = Upgrade::default();
         let service = hyper::service::service_fn(|request| {
-            let answer = self.answer(request, info, local_ip, &upgrade);
+            let answer = self.answer(request, info, &arrival, &upgrade);
             async { Ok::<_, Infallible>(answer.await) }
         });
         let io = TokioIo::new(MeteredSocket::new(socket, first_bytes, ()));
@@ -144,15 +143,15 @@ impl WebServer {
         &self,
         request: Request<Incoming>,
         info: &ConnectionInfo,
-        local_ip: Option<IpAddr>,
+        arrival: &Arrival,
         upgrade: &Upgrade,
     ) -> Answer {
-        let host = match self.access.check_site(request.headers(), local_ip) {
-            Ok(host) => host,
+        let websocket_origins = match self.access.check_site(request.headers(), arrival) {
+            Ok(origins) => origins,
             Err(denied) => return denied_answer(denied),
         };
-        match (request.uri().path(), request.method()) {
-            ("/", &Method::GET) => self.page_answer(host),
+        match (self.access.path_below_public_url(request.uri().path()), request.method()) {
+            ("/", &Method::GET) => self.page_answer(&websocket_origins),
             ("/healthz", &Method::GET) => self.health_answer(),
             ("/recording", &Method::GET) => self.recording_answer(request.headers(), info).await,
             ("/session", &Method::POST) => self.session_answer(request.into_body()).await,
@@ -212,14 +211,15 @@ impl WebServer {
         }
     }
 
-    fn page_answer(&self, host: &str) -> Answer {
+    fn page_answer(&self, websocket_origins: &str) -> Answer {
         let mut answer = answer_with(StatusCode::OK, "text/html; charset=utf-8", self.page.body.clone());
         let headers = answer.headers_mut();
         if self.page.is_compressed {
             headers.insert(header::CONTENT_ENCODING, HeaderValue::from_static("gzip"));
         }
-        // The host was parsed before, so it is a valid header value.
-        if let Ok(policy) = HeaderValue::try_from(self.page.policy(host, self.authenticator.authentication())) {
+        // The hosts were parsed before, so they are valid header values.
+        let policy = self.page.policy(websocket_origins, self.authenticator.authentication());
+        if let Ok(policy) = HeaderValue::try_from(policy) {
             headers.insert(header::CONTENT_SECURITY_POLICY, policy);
         }
         answer

@@ -57,18 +57,18 @@ impl Page {
         Ok(Self { body: body.into(), is_compressed: false, script_sources: script_sources(&html)? })
     }
 
-    /// The content security policy for a page that was loaded from `host`, which may have a port. Only the scripts of
-    /// the page may run, and only this server may be connected to. Any page may embed the viewer, as notebooks do: a frame
-    /// has no session until its own link gives it one. A server without authentication needs no session, so only pages of
-    /// this machine may embed its viewer.
-    pub(super) fn policy(&self, host: &str, authentication: Authentication) -> String {
+    /// The content security policy of a page that connects to `websocket_origins`, such as `ws://localhost:50051`. Only the
+    /// scripts of the page may run, and only this server may be connected to. Any page may embed the viewer, as notebooks do:
+    /// a frame has no session until its own link gives it one. A server without authentication needs no session, so only
+    /// pages of this machine may embed its viewer.
+    pub(super) fn policy(&self, websocket_origins: &str, authentication: Authentication) -> String {
         let ancestors = match authentication {
             Authentication::Off => "; frame-ancestors 'self' http://localhost:* http://127.0.0.1:*",
             Authentication::UsersAndTokens | Authentication::Tokens => "",
         };
         format!(
             "default-src 'none'; script-src{}; style-src 'unsafe-inline'; img-src 'self' data: blob:; font-src data:; \
-             worker-src blob:; connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'{ancestors}",
+             worker-src blob:; connect-src 'self' {websocket_origins}; base-uri 'none'; form-action 'none'{ancestors}",
             self.script_sources
         )
     }
@@ -123,10 +123,10 @@ mod tests {
     fn viewer_is_intact() {
         let page = Page::viewer().expect("expected the viewer");
         assert!(page.body.starts_with(&[0x1f, 0x8b]));
-        let policy = page.policy("localhost:8000", Authentication::UsersAndTokens);
+        let policy = page.policy("ws://localhost:8000", Authentication::UsersAndTokens);
         assert!(policy.contains("connect-src 'self' ws://localhost:8000;"), "{policy}");
         assert!(!policy.contains("script-src 'unsafe") && !policy.contains("frame-ancestors"), "{policy}");
-        let policy = page.policy("localhost:8000", Authentication::Off);
+        let policy = page.policy("ws://localhost:8000", Authentication::Off);
         assert!(policy.contains("frame-ancestors 'self' http://localhost:*"), "{policy}");
     }
 
@@ -140,7 +140,7 @@ mod tests {
             "<script id=\"recording\" type=\"text/plain\" data-path=\"recording\" data-slow=\"100\"></script>";
         assert_eq!(html.replace(element, RECORDING_PLACE), viewer_html().expect("expected the viewer"));
         assert!(!page.is_compressed && viewer.is_compressed);
-        let policy = |page: &Page| page.policy("localhost", Authentication::Tokens);
+        let policy = |page: &Page| page.policy("ws://localhost", Authentication::Tokens);
         assert_eq!(policy(&page), policy(&viewer));
     }
 }

@@ -1,0 +1,62 @@
+//! Metrics in the text format of OpenMetrics, which Prometheus reads.
+
+use prometheus_client::encoding::text;
+use prometheus_client::metrics::counter::Counter;
+use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
+use prometheus_client::metrics::info::Info;
+use prometheus_client::registry::Registry;
+
+use super::super::connection_gauges::ConnectionGauges;
+use crate::BUILD;
+use crate::engine::Engine;
+use crate::identity::Principal;
+use modalcast_model::error::{Result, fault_in};
+
+/// The metrics of a server. Those of the engine are read when they are asked for.
+pub(super) struct Metrics {
+    registry: Registry,
+    engine: Engine,
+    open_scenes: Gauge,
+    memory: Family<[(&'static str, &'static str); 2], Gauge>,
+}
+
+impl Metrics {
+    /// `auth_failures` counts rejected calls.
+    pub(super) fn new(engine: Engine, connections: &ConnectionGauges, auth_failures: Counter) -> Self {
+        let mut registry = Registry::with_prefix("modalcast");
+        let build = Info::new([("version", env!("CARGO_PKG_VERSION")), ("sources", BUILD)]);
+        registry.register("build", "Version of the server, and the hash of its sources", build);
+        let open_scenes = Gauge::default();
+        registry.register("open_scenes", "Open scenes", open_scenes.clone());
+        registry.register("connections", "Open connections after their first bytes", connections.family());
+        let help = "Calls without a known credential, and calls that the role does not permit";
+        registry.register("auth_failures", help, auth_failures);
+        let memory = Family::<[(&'static str, &'static str); 2], Gauge>::default();
+        registry.register("memory_bytes", "Memory that the scenes have reserved", memory.clone());
+        let limits = Family::<[(&'static str, &'static str); 1], Gauge>::default();
+        for (kind, bytes) in engine.memory_use().map(|(kind, memory)| (kind, memory.limit)) {
+            limits.get_or_create(&[("kind", kind)]).set(to_gauge(bytes));
+        }
+        registry.register("memory_limit_bytes", "Limit on the memory of all scenes", limits);
+        Self { registry, engine, open_scenes, memory }
+    }
+
+    /// The text of all metrics.
+    ///
+    /// # Errors
+    /// `Fault` when the text cannot be written.
+    pub(super) fn render(&self) -> Result<String> {
+        self.open_scenes.set(self.engine.list(&Principal::owner()).open.len() as i64);
+        for (kind, memory) in self.engine.memory_use() {
+            self.memory.get_or_create(&[("kind", kind), ("use", "scenes")]).set(to_gauge(memory.reserved));
+        }
+        let mut text = String::new();
+        text::encode(&mut text, &self.registry).map_err(fault_in("metrics"))?;
+        Ok(text)
+    }
+}
+
+fn to_gauge(bytes: u64) -> i64 {
+    i64::try_from(bytes).unwrap_or(i64::MAX)
+}
