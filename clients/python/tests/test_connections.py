@@ -62,8 +62,8 @@ def test_connect_to_no_server_says_how_to_start_one():
 
 
 def test_invalid_addresses_are_rejected():
-    for address in ("https://127.0.0.1:1", ""):
-        with pytest.raises(ValueError, match="expected HOST:PORT, http://HOST:PORT or unix:PATH"):
+    for address in ("ftp://127.0.0.1:1", ""):
+        with pytest.raises(ValueError, match="expected HOST:PORT, http://HOST:PORT, https://HOST:PORT or unix:PATH"):
             mc.connect(address)
 
 

@@ -6,8 +6,11 @@ import functools
 import os
 import socket
 import stat
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import grpc
 
 # Bytes. The server sends messages of at most 3 MiB.
 _MAX_MESSAGE_BYTES = 4 << 20
@@ -59,17 +62,39 @@ def default_address() -> str:
 
 
 def target_of(address: str) -> str:
-    """The target of a connection: HOST, HOST:PORT, http://HOST:PORT or unix:PATH. The default port is 50051.
+    """The target of a connection: HOST, HOST:PORT, http://HOST:PORT, https://HOST:PORT or unix:PATH.
+
+    The default port is 50051, and 443 for https.
 
     Raises:
         ValueError: The address has another scheme.
     """
-    target = address.removeprefix("http://").rstrip("/")
+    default_port = 443 if is_encrypted(address) else 50051
+    target = address.removeprefix("http://").removeprefix("https://").rstrip("/")
     if "://" in target:
-        raise ValueError(f"address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got '{address}'")
+        raise ValueError(f"address: expected {_ADDRESSES}, got '{address}'")
     if not target:
-        raise ValueError("address: expected HOST:PORT, http://HOST:PORT or unix:PATH, got an empty text")
-    return target if ":" in target else f"{target}:50051"
+        raise ValueError(f"address: expected {_ADDRESSES}, got an empty text")
+    return target if ":" in target else f"{target}:{default_port}"
+
+
+_ADDRESSES = "HOST:PORT, http://HOST:PORT, https://HOST:PORT or unix:PATH"
+
+
+def is_encrypted(address: str) -> bool:
+    """Whether connections to an address are encrypted."""
+    return address.startswith("https://")
+
+
+@dataclass(frozen=True, repr=False)
+class ConnectOptions:
+    """What a caller gives to connect to a server; see `connect`."""
+
+    token: str | None = None
+    ca: str | Path | None = None
+    certificate: str | Path | None = None
+    key: str | Path | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 @dataclass(frozen=True, repr=False)
@@ -78,33 +103,64 @@ class Route:
 
     Attributes:
         target: The target of connections.
-        metadata: Sent with every call: the token, if there is one.
+        metadata: Sent with every call: the token, if there is one, and the metadata of the caller.
+        credentials: The certificates of an encrypted connection; None: it is plain.
     """
 
     target: str
     metadata: tuple[tuple[str, str], ...] = ()
+    credentials: grpc.ChannelCredentials | None = None
 
 
-def route_to(address: str, token: str | None) -> Route:
+def route_to(address: str, options: ConnectOptions) -> Route:
     """The way to the server at an address.
 
-    Without a token, a server of this user on this machine is reached at its Unix socket, where the user is the
-    credential. The environment variable MODALCAST_TOKEN_FILE names a file with a token.
+    Without a token, a plain server of this user on this machine is reached at its Unix socket, where the user is the
+    credential. The environment variable MODALCAST_TOKEN_FILE names a file with a token, and MODALCAST_CA_FILE one with
+    the certificates of authorities.
 
     Raises:
-        ValueError: The address or the token is invalid.
-        OSError: The file of the token cannot be read.
+        ValueError: The address or an option is invalid.
+        OSError: A file cannot be read.
     """
     target = target_of(address)
+    credentials = _credentials(address, options)
+    metadata = tuple(options.metadata.items())
+    for name, value in metadata:
+        if not (_is_text(name) and name == name.lower() and value.isascii() and value.isprintable()):
+            raise ValueError(f"metadata: expected lower-case names and values of visible ASCII letters, got '{name}'")
+    token = options.token
     path = os.environ.get("MODALCAST_TOKEN_FILE")
     if token is None and path and not target.startswith("unix:"):
         token = Path(path).read_text().strip()
     if token is None:
-        path = _local_socket(target)
-        return Route(target if path is None else f"unix:{path}")
-    if not (token.isascii() and token.isprintable() and token and " " not in token):
+        socket_path = None if credentials else _local_socket(target)
+        return Route(target if socket_path is None else f"unix:{socket_path}", metadata, credentials)
+    if not _is_text(token):
         raise ValueError("token: expected visible ASCII letters, got another text")
-    return Route(target, (("authorization", f"Bearer {token}"),))
+    return Route(target, (*metadata, ("authorization", f"Bearer {token}")), credentials)
+
+
+def _is_text(text: str) -> bool:
+    return bool(text) and text.isascii() and text.isprintable() and " " not in text
+
+
+def _credentials(address: str, options: ConnectOptions) -> grpc.ChannelCredentials | None:
+    """The certificates of an encrypted connection.
+
+    Raises:
+        ValueError: Certificates are given for a plain connection, or a certificate without its key.
+        OSError: A file cannot be read.
+    """
+    if (options.certificate is None) != (options.key is None):
+        raise ValueError("certificate, key: expected both or none, got one")
+    if not is_encrypted(address):
+        if options.ca is not None or options.certificate is not None:
+            raise ValueError(f"address: expected https://HOST:PORT with certificates, got '{address}'")
+        return None
+    ca = options.ca if options.ca is not None else os.environ.get("MODALCAST_CA_FILE") or None
+    contents = [None if path is None else Path(path).read_bytes() for path in (ca, options.key, options.certificate)]
+    return grpc.ssl_channel_credentials(*contents)
 
 
 def _local_socket(target: str) -> Path | None:

@@ -202,6 +202,20 @@ def from_rpc_error(error: grpc.RpcError, address: str) -> Error:
     )
 
 
+def connection_remedy(message: str) -> str:
+    """What a user can do after `connect` has failed with a message of gRPC."""
+    if "CERTIFICATE_VERIFY_FAILED" in message or "Peer name" in message or "Hostname Verification" in message:
+        return (
+            "The certificate of the server is not accepted: name the file of its authority, or of the certificate "
+            "itself if it is self-signed, by ca= or MODALCAST_CA_FILE, and use a host name of the certificate"
+        )
+    if "WRONG_VERSION_NUMBER" in message:
+        return "The server does not speak TLS: use http:// in its address"
+    if "http1.x server" in message:
+        return "The server expects TLS: use https:// in its address"
+    return "Start a server with `modalcast serve`, or use `spawn`"
+
+
 def from_rejection(rejection: errors_pb2.Rejection) -> ServerError:
     """Converts a rejection on a step stream."""
     try:

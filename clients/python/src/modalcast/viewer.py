@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-from modalcast._channel import target_of
+from modalcast._channel import is_encrypted, target_of
 from modalcast.errors import Unavailable
 
 
@@ -57,4 +57,5 @@ def viewer_link(address: str, url_path: str, scene: str, height: int) -> ViewerL
     if target.startswith("unix:"):
         raise Unavailable(f"{address}: expected an address HOST:PORT, which browsers can use, got a Unix socket")
     separator = "&" if "#" in url_path else "#"
-    return ViewerLink(f"http://{target}{url_path}{separator}scene={quote(scene)}", height)
+    scheme = "https" if is_encrypted(address) else "http"
+    return ViewerLink(f"{scheme}://{target}{url_path}{separator}scene={quote(scene)}", height)

@@ -11,7 +11,7 @@ import grpc
 import grpc.aio
 from google.protobuf.message import Message
 
-from modalcast._channel import keep_memory_of_messages, options_of, route_to
+from modalcast._channel import ConnectOptions, keep_memory_of_messages, options_of, route_to
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
@@ -154,15 +154,15 @@ class Transport:
     Subscriptions that are not read fill the flow-control window of their connection, but not that of calls.
     """
 
-    def __init__(self, address: str, token: str | None) -> None:
-        """Connects with the first call, and sends the token with every call.
+    def __init__(self, address: str, options: ConnectOptions) -> None:
+        """Connects with the first call, and sends the token and the metadata with every call.
 
         Raises:
-            ValueError: The address or the token is invalid.
-            OSError: The file of the token cannot be read.
+            ValueError: The address or an option is invalid.
+            OSError: A file cannot be read.
         """
         self.address = address
-        self._route = route_to(address, token)
+        self._route = route_to(address, options)
         keep_memory_of_messages()
         self._channel = self._new_channel()
         self._subscriptions: grpc.aio.Channel | None = None
@@ -256,7 +256,10 @@ class Transport:
         return ReplyStream(started, self.address)
 
     def _new_channel(self) -> grpc.aio.Channel:
-        return grpc.aio.insecure_channel(self._route.target, options=options_of(self._route.target))
+        target, credentials = self._route.target, self._route.credentials
+        if credentials is None:
+            return grpc.aio.insecure_channel(target, options=options_of(target))
+        return grpc.aio.secure_channel(target, credentials, options=options_of(target))
 
     def _new_subscription_channel(self) -> grpc.aio.Channel:
         # As the channel for calls; the synchronous client needs other options here.

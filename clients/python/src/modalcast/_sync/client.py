@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from numpy.typing import ArrayLike
 
-from modalcast._channel import default_address
+from modalcast._channel import ConnectOptions, default_address
 from modalcast._methods import (
     DELETE_SCENE,
     FIND_UPLOADED_FILES,
@@ -29,7 +29,14 @@ from modalcast._sync.scene import Scene, open_scene
 from modalcast._sync.streams import with_reconnect
 from modalcast._sync.transport import RETRY_SECONDS, Transport, sleep
 from modalcast._types import Vector
-from modalcast.errors import ConnectionLost, NotFound, ProtocolVersionError, ServerError, ServerStartError
+from modalcast.errors import (
+    ConnectionLost,
+    NotFound,
+    ProtocolVersionError,
+    ServerError,
+    ServerStartError,
+    connection_remedy,
+)
 from modalcast.upload import LocalFile, Progress, SceneBuilder, file_messages, local_files
 from modalcast.v1 import scenes_pb2, server_pb2
 
@@ -325,6 +332,10 @@ def connect(
     address: str | None = None,
     *,
     token: str | None = None,
+    ca: str | Path | None = None,
+    certificate: str | Path | None = None,
+    key: str | Path | None = None,
+    metadata: Mapping[str, str] | None = None,
     timeout: float = 60.0,
     reconnect: float = 10.0,
     connect_timeout: float = 5.0,
@@ -335,29 +346,37 @@ def connect(
     tells it who you are. Other servers need one.
 
     Args:
-        address: HOST:PORT, http://HOST:PORT or unix:PATH; None: the environment variable MODALCAST_SERVER, or
-            127.0.0.1:50051.
+        address: HOST:PORT, http://HOST:PORT, https://HOST:PORT or unix:PATH; None: the environment variable
+            MODALCAST_SERVER, or 127.0.0.1:50051.
         token: Identifies you to the server; None: the token in the file that the environment variable
-            MODALCAST_TOKEN_FILE names, if any. Anyone on the way can read it, unless the connection stays on this
-            machine or goes through a tunnel.
+            MODALCAST_TOKEN_FILE names, if any. Anyone on the way can read it, unless the connection is encrypted
+            (https), stays on this machine or goes through a tunnel.
+        ca: PEM file with the authorities whose certificates are accepted from an https server; a self-signed one is its
+            own authority. None: the file that the environment variable MODALCAST_CA_FILE names, or else public
+            authorities.
+        certificate: PEM file with a certificate that identifies you to an https server.
+        key: PEM file with the private key of `certificate`.
+        metadata: Sent with every call, for a proxy in front of the server.
         timeout: Default time limit of a call, in seconds.
         reconnect: Seconds for which calls without side effects, streams of the latest steps and drives wait for the
             server after a lost connection; 0: they raise `ConnectionLost` at once.
         connect_timeout: Seconds in which the server must answer.
 
     Raises:
-        ConnectionLost: No server answers.
+        ConnectionLost: No server answers, or its certificate is not accepted.
         Unauthenticated: The server does not know you.
         ProtocolVersionError: The server has another version of the contract.
-        ValueError: The address or the token is invalid.
+        ValueError: The address or an option is invalid.
+        OSError: A file cannot be read.
     """
-    transport = Transport(default_address() if address is None else address, token)
+    options = ConnectOptions(token=token, ca=ca, certificate=certificate, key=key, metadata=metadata or {})
+    transport = Transport(default_address() if address is None else address, options)
     client = Client(transport, timeout=timeout, reconnect=reconnect, server=None)
     try:
         client.check_version(connect_timeout)
     except ConnectionLost as error:
         transport.close()
-        raise ConnectionLost(f"{error}. Start a server with `modalcast serve`, or use `spawn`") from None
+        raise ConnectionLost(f"{error}. {connection_remedy(str(error))}") from None
     except BaseException:
         transport.close()
         raise
@@ -392,7 +411,7 @@ def spawn(
                 raise ServerStartError(f"the server did not listen within {start_timeout:g} s: {server.log()}")
             sleep(RETRY_SECONDS)
             waited += RETRY_SECONDS
-        transport = Transport(address, server.token())
+        transport = Transport(address, ConnectOptions(token=server.token()))
         client = Client(transport, timeout=timeout, reconnect=0.0, server=server)
         client.check_version(timeout)
     except BaseException:

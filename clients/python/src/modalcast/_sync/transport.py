@@ -12,7 +12,7 @@ import grpc
 from google.protobuf.message import Message
 from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTypeStubs]
 
-from modalcast._channel import keep_memory_of_messages, options_of, route_to
+from modalcast._channel import ConnectOptions, keep_memory_of_messages, options_of, route_to
 from modalcast._chunks import malformed
 from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._step_progress import Progress
@@ -208,15 +208,15 @@ class Transport:
     Subscriptions that are not read fill the flow-control window of their connection, but not that of calls.
     """
 
-    def __init__(self, address: str, token: str | None) -> None:
-        """Connects with the first call, and sends the token with every call.
+    def __init__(self, address: str, options: ConnectOptions) -> None:
+        """Connects with the first call, and sends the token and the metadata with every call.
 
         Raises:
-            ValueError: The address or the token is invalid.
-            OSError: The file of the token cannot be read.
+            ValueError: The address or an option is invalid.
+            OSError: A file cannot be read.
         """
         self.address = address
-        self._route = route_to(address, token)
+        self._route = route_to(address, options)
         keep_memory_of_messages()
         self._channel = self._new_channel()
         self._subscriptions: grpc.Channel | None = None
@@ -312,7 +312,13 @@ class Transport:
         # With this option, the calling thread reads the replies of a call, without a thread per call. A cancelled call
         # then keeps its connection open. Subscriptions are cancelled often, so their channel has no such option.
         single_threaded = (ChannelOptions.SingleThreadedUnaryStream, 1)
-        return grpc.insecure_channel(self._route.target, options=[*options_of(self._route.target), single_threaded])
+        return self._channel_with([single_threaded])
 
     def _new_subscription_channel(self) -> grpc.Channel:
-        return grpc.insecure_channel(self._route.target, options=options_of(self._route.target))
+        return self._channel_with([])
+
+    def _channel_with(self, options: list[tuple[str, int | str]]) -> grpc.Channel:
+        target, credentials = self._route.target, self._route.credentials
+        if credentials is None:
+            return grpc.insecure_channel(target, options=[*options_of(target), *options])
+        return grpc.secure_channel(target, credentials, options=[*options_of(target), *options])
