@@ -56,6 +56,15 @@ pub struct BeamModes {
     pub mode_shapes: DMatrix<f64>,
 }
 
+/// The inertia of modes with the beam's own mass M, without the carried bodies.
+#[derive(Debug, Clone)]
+pub struct ModalInertia {
+    /// R^T M Phi (6 x r): momentum and angular momentum about the origin per unit rate of each mode.
+    pub momenta: Matrix6xX<f64>,
+    /// Phi^T M Phi (r x r).
+    pub masses: DMatrix<f64>,
+}
+
 impl Beam {
     /// A beam through N + 1 `nodes` (meters) with N elements.
     ///
@@ -139,23 +148,22 @@ impl Beam {
     /// R^T M R: the inertia of the beam and its own bodies about the origin of the coordinates of the nodes.
     pub fn rigid_inertia(&self) -> RigidInertia {
         let rigid = self.rigid_dofs();
-        let (_, mass) = self.assemble(&self.own_bodies);
-        let matrix = rigid.tr_mul(&mass.multiply(&rigid));
+        let matrix = rigid.tr_mul(&self.assemble_mass(&self.own_bodies).multiply(&rigid));
         RigidInertia::from_matrix(Matrix6::from_fn(|row, column| matrix[(row, column)]))
     }
 
-    /// R^T M Phi (6 x r): momentum and angular momentum about the origin per unit rate of each mode.
-    pub fn modal_momenta(&self, modes: &BeamModes) -> Matrix6xX<f64> {
-        let (_, mass) = self.assemble(&self.own_bodies);
-        let momenta = self.rigid_dofs().tr_mul(&mass.multiply(&modes.mode_shapes));
-        Matrix6xX::from_fn(momenta.ncols(), |row, column| momenta[(row, column)])
-    }
-
-    /// Phi^T M Phi (r x r) with the beam's own mass, without the carried bodies.
-    pub fn modal_masses(&self, modes: &BeamModes) -> DMatrix<f64> {
-        let (_, mass) = self.assemble(&self.own_bodies);
-        let product = modes.mode_shapes.tr_mul(&mass.multiply(&modes.mode_shapes));
-        (&product + product.transpose()) * 0.5
+    /// The inertia of the beam's modes with its own mass.
+    pub fn modal_inertia(&self, modes: &BeamModes) -> ModalInertia {
+        if modes.mode_shapes.ncols() == 0 {
+            return ModalInertia { momenta: Matrix6xX::zeros(0), masses: DMatrix::zeros(0, 0) };
+        }
+        let momentum = self.assemble_mass(&self.own_bodies).multiply(&modes.mode_shapes);
+        let momenta = self.rigid_dofs().tr_mul(&momentum);
+        let masses = modes.mode_shapes.tr_mul(&momentum);
+        ModalInertia {
+            momenta: Matrix6xX::from_fn(momenta.ncols(), |row, column| momenta[(row, column)]),
+            masses: (&masses + masses.transpose()) * 0.5,
+        }
     }
 
     /// H (6 x r): the motion of the section at a station, per unit of each mode. Rows 0 to 2 are the displacement of
@@ -185,8 +193,7 @@ impl Beam {
         let (element, interpolation) = self.interpolation(station);
         let mut load = DMatrix::zeros(6 * self.nodes.len(), 1);
         load.fixed_view_mut::<12, 1>(6 * element, 0).copy_from(&(interpolation.transpose() * wrench));
-        let (stiffness, _) = self.assemble(&[]);
-        let factor = stiffness.without_first(6).factor().ok_or(BeamError::Singular)?;
+        let factor = self.assemble_stiffness().without_first(6).factor().ok_or(BeamError::Singular)?;
         let free = factor.solve_upper(factor.solve_lower(load.rows(6, load.nrows() - 6).into_owned()));
         let mut dofs = DVector::zeros(6 * self.nodes.len());
         dofs.rows_mut(6, free.nrows()).copy_from(&free.column(0));
@@ -205,11 +212,11 @@ impl Beam {
     /// # Errors
     /// `Singular` if K is not positive definite, or `NotConverged`.
     pub fn solve_modes(&self, count: usize) -> Result<BeamModes> {
+        if count == 0 {
+            return Ok(self.create_modes(&[], DMatrix::zeros(6 * self.elements.len(), 0)));
+        }
         let (stiffness, mass) = self.assemble_free();
         let factor = stiffness.factor().ok_or(BeamError::Singular)?;
-        if count == 0 {
-            return Ok(self.create_modes(&[], DMatrix::zeros(mass.size(), 0)));
-        }
         let vector_count = (count + SPARE_VECTORS).min(mass.size());
         let mut vectors = start_vectors(mass.size(), vector_count);
         let mut inverse_eigenvalues = vec![f64::INFINITY; count.min(vector_count)];
@@ -256,23 +263,30 @@ impl Beam {
     /// K, and M with the own and the carried bodies, of the 6 N free degrees of freedom.
     pub(crate) fn assemble_free(&self) -> (BandMatrix, BandMatrix) {
         let bodies: Vec<_> = self.own_bodies.iter().chain(&self.carried_bodies).copied().collect();
-        let (stiffness, mass) = self.assemble(&bodies);
-        (stiffness.without_first(6), mass.without_first(6))
+        (self.assemble_stiffness().without_first(6), self.assemble_mass(&bodies).without_first(6))
     }
 
-    /// K, and M with `bodies`, of the 6 (N + 1) degrees of freedom, including those of the clamped node.
-    fn assemble(&self, bodies: &[(Station, RigidInertia)]) -> (BandMatrix, BandMatrix) {
-        let (mut stiffness, mut mass) =
-            (BandMatrix::zeros(6 * self.nodes.len()), BandMatrix::zeros(6 * self.nodes.len()));
-        for index in 0..self.elements.len() {
-            let (k, m) = self.element(index).matrices();
-            add_element(&mut stiffness, index, &k);
-            add_element(&mut mass, index, &m);
-        }
+    /// K of the 6 (N + 1) degrees of freedom, including those of the clamped node.
+    fn assemble_stiffness(&self) -> BandMatrix {
+        self.assemble(Element::stiffness)
+    }
+
+    /// M with `bodies` of the 6 (N + 1) degrees of freedom.
+    fn assemble_mass(&self, bodies: &[(Station, RigidInertia)]) -> BandMatrix {
+        let mut mass = self.assemble(Element::mass);
         for (Station { element, fraction }, body) in bodies {
             add_element(&mut mass, *element, &self.element(*element).body_mass(*fraction, body));
         }
-        (stiffness, mass)
+        mass
+    }
+
+    /// The sum of the matrices of all elements.
+    fn assemble(&self, matrix_of: impl Fn(&Element) -> Matrix12) -> BandMatrix {
+        let mut matrix = BandMatrix::zeros(6 * self.nodes.len());
+        for index in 0..self.elements.len() {
+            add_element(&mut matrix, index, &matrix_of(&self.element(index)));
+        }
+        matrix
     }
 
     fn element(&self, index: usize) -> Element {

@@ -7,7 +7,7 @@
 //! Euler and Bernoulli for slender elements, so neither thin nor thick elements lock. The mass includes the rotary
 //! inertia of the sections.
 
-use nalgebra::{Matrix3, RowSVector, SMatrix, Vector3, Vector4};
+use nalgebra::{Matrix2, Matrix3, Matrix4, SMatrix, SVector, Vector2, Vector3, Vector4};
 
 use crate::inertia::RigidInertia;
 use crate::profile::{ElasticConstants, Profile};
@@ -75,6 +75,16 @@ impl BendingBasis {
     }
 }
 
+/// Stiffness or mass of an element in its local axes. Stretch, twist and bending in two planes do not act on each other.
+struct ElementParts {
+    /// Of the displacements along the element.
+    stretch: Matrix2<f64>,
+    /// Of the rotations about the element.
+    twist: Matrix2<f64>,
+    /// Per plane: of the degrees of freedom of [`BENDING_Y`] and [`BENDING_Z`].
+    bending: [Matrix4<f64>; 2],
+}
+
 /// One element between two nodes.
 pub(crate) struct Element {
     length: f64,
@@ -96,29 +106,52 @@ impl Element {
         Self { length, axes, profile, material, shear_ratios }
     }
 
-    /// Stiffness and consistent mass in the coordinate frame of the nodes.
-    pub(crate) fn matrices(&self) -> (Matrix12, Matrix12) {
-        let (mut stiffness, mut mass) = (Matrix12::zeros(), Matrix12::zeros());
-        let ElasticConstants { youngs_modulus, shear_modulus, density } = self.material;
-        let slopes = [-1.0 / self.length, 1.0 / self.length];
+    /// Stiffness in the coordinate frame of the nodes.
+    pub(crate) fn stiffness(&self) -> Matrix12 {
+        let ElasticConstants { youngs_modulus, shear_modulus, .. } = self.material;
+        let slopes = Vector2::new(-1.0, 1.0) / self.length;
+        let mut parts = ElementParts::zeros();
         for (x, weight) in GAUSS_POINTS {
             let (section, weight) = (self.profile.section(x), weight * self.length);
-            let values = [1.0 - x, x];
-            add_linear(&mut stiffness, 0, slopes, weight * youngs_modulus * section.area);
-            add_linear(&mut stiffness, 3, slopes, weight * shear_modulus * section.torsion);
-            add_linear(&mut mass, 0, values, weight * density * section.area);
-            add_linear(&mut mass, 3, values, weight * density * section.polar_moment());
-            for (plane, dofs) in [BENDING_Y, BENDING_Z].iter().enumerate() {
+            parts.stretch += square(&slopes) * (weight * youngs_modulus * section.area);
+            parts.twist += square(&slopes) * (weight * shear_modulus * section.torsion);
+            for (plane, bending) in parts.bending.iter_mut().enumerate() {
                 let basis = BendingBasis::new(x, self.length, self.shear_ratios[plane]);
-                let moment = section.moments[plane];
-                add_bending(&mut stiffness, dofs, &basis.curvatures, weight * youngs_modulus * moment);
-                add_bending(&mut stiffness, dofs, &basis.shears, weight * shear_modulus * section.shear_area);
-                add_bending(&mut mass, dofs, &basis.values, weight * density * section.area);
-                add_bending(&mut mass, dofs, &basis.rotations, weight * density * moment);
+                *bending += square(&basis.curvatures) * (weight * youngs_modulus * section.moments[plane]);
+                *bending += square(&basis.shears) * (weight * shear_modulus * section.shear_area);
             }
         }
-        let rotation = self.rotation_of_nodes();
-        (rotation.transpose() * stiffness * rotation, rotation.transpose() * mass * rotation)
+        self.to_global_axes(&parts.assemble())
+    }
+
+    /// Consistent mass in the coordinate frame of the nodes.
+    pub(crate) fn mass(&self) -> Matrix12 {
+        let mut parts = ElementParts::zeros();
+        for (x, weight) in GAUSS_POINTS {
+            let section = self.profile.section(x);
+            let density = weight * self.length * self.material.density;
+            let values = Vector2::new(1.0 - x, x);
+            parts.stretch += square(&values) * (density * section.area);
+            parts.twist += square(&values) * (density * section.polar_moment());
+            for (plane, bending) in parts.bending.iter_mut().enumerate() {
+                let basis = BendingBasis::new(x, self.length, self.shear_ratios[plane]);
+                *bending += square(&basis.values) * (density * section.area);
+                *bending += square(&basis.rotations) * (density * section.moments[plane]);
+            }
+        }
+        self.to_global_axes(&parts.assemble())
+    }
+
+    /// A symmetric matrix in the coordinate frame of the nodes. Each 3 x 3 block belongs to two vectors of degrees of
+    /// freedom.
+    fn to_global_axes(&self, local: &Matrix12) -> Matrix12 {
+        let mut global = Matrix12::zeros();
+        for (row, column) in (0..4).flat_map(|row| (0..=row).map(move |column| (3 * row, 3 * column))) {
+            let block = self.axes.transpose() * local.fixed_view::<3, 3>(row, column) * self.axes;
+            global.fixed_view_mut::<3, 3>(row, column).copy_from(&block);
+            global.fixed_view_mut::<3, 3>(column, row).copy_from(&block.transpose());
+        }
+        global
     }
 
     /// Displacement of the center (rows 0 to 2) and rotation vector (rows 3 to 5) of the section at a fraction of the
@@ -136,11 +169,10 @@ impl Element {
                 local[(rotation_row, dofs[index])] = sign * signs[index] * basis.rotations[index];
             }
         }
-        let rotated = local * self.rotation_of_nodes();
         let mut interpolation = Interpolation::zeros();
-        for row in [0, 3] {
-            let block = self.axes.transpose() * rotated.fixed_rows::<3>(row);
-            interpolation.fixed_rows_mut::<3>(row).copy_from(&block);
+        for (row, column) in [0, 3].into_iter().flat_map(|row| [0, 3, 6, 9].map(|column| (row, column))) {
+            let block = self.axes.transpose() * local.fixed_view::<3, 3>(row, column) * self.axes;
+            interpolation.fixed_view_mut::<3, 3>(row, column).copy_from(&block);
         }
         interpolation
     }
@@ -151,31 +183,31 @@ impl Element {
         let interpolation = self.interpolation(fraction);
         interpolation.transpose() * body.matrix() * interpolation
     }
+}
 
-    /// The local axes for the four vectors of the degrees of freedom.
-    fn rotation_of_nodes(&self) -> Matrix12 {
-        let mut local_from_global = Matrix12::zeros();
-        for block in 0..4 {
-            local_from_global.fixed_view_mut::<3, 3>(3 * block, 3 * block).copy_from(&self.axes);
+impl ElementParts {
+    fn zeros() -> Self {
+        Self { stretch: Matrix2::zeros(), twist: Matrix2::zeros(), bending: [Matrix4::zeros(); 2] }
+    }
+
+    /// The matrix of all twelve degrees of freedom.
+    fn assemble(&self) -> Matrix12 {
+        let mut matrix = Matrix12::zeros();
+        for (dof, part) in [(0, &self.stretch), (3, &self.twist)] {
+            for (row, column) in (0..2).flat_map(|row| [0, 1].map(|column| (row, column))) {
+                matrix[(dof + 6 * row, dof + 6 * column)] = part[(row, column)];
+            }
         }
-        local_from_global
+        for ((dofs, signs), part) in [BENDING_Y, BENDING_Z].iter().zip(&self.bending) {
+            for (row, column) in (0..4).flat_map(|row| [0, 1, 2, 3].map(|column| (row, column))) {
+                matrix[(dofs[row], dofs[column])] = signs[row] * signs[column] * part[(row, column)];
+            }
+        }
+        matrix
     }
 }
 
-/// Adds the outer product of linear shape functions, for the degree of freedom `dof` of both nodes.
-fn add_linear(matrix: &mut Matrix12, dof: usize, shape_functions: [f64; 2], factor: f64) {
-    for (row, a) in shape_functions.iter().enumerate() {
-        for (column, b) in shape_functions.iter().enumerate() {
-            matrix[(dof + 6 * row, dof + 6 * column)] += factor * a * b;
-        }
-    }
-}
-
-/// Adds the outer product of the shape functions of one plane of bending.
-fn add_bending(matrix: &mut Matrix12, (dofs, signs): &([usize; 4], [f64; 4]), weights: &Vector4<f64>, factor: f64) {
-    let mut row = RowSVector::<f64, 12>::zeros();
-    for index in 0..4 {
-        row[dofs[index]] = signs[index] * weights[index];
-    }
-    *matrix += row.transpose() * row * factor;
+/// The outer product of a vector with itself.
+fn square<const N: usize>(vector: &SVector<f64, N>) -> SMatrix<f64, N, N> {
+    vector * vector.transpose()
 }

@@ -6,8 +6,8 @@
 //! [`Beam::solve_modes`] computes *loaded-interface modes* (Benfield and Hruda, "Vibration analysis of structures by
 //! component mode substitution", AIAA Journal 9, 1971): the modes of the clamped beam that carries at each joint the
 //! rigid inertia D_c of everything beyond the joint, K phi = lambda (M + sum P_c^T D_c P_c) phi. P_c is the motion of the
-//! section at the joint. [`Beam::rigid_inertia`], [`Beam::modal_momenta`] and [`Beam::modal_masses`] are R^T M R,
-//! R^T M Phi and Phi^T M Phi with the beam's own mass M.
+//! section at the joint. [`Beam::rigid_inertia`] is R^T M R with the beam's own mass M, and [`Beam::modal_inertia`] has
+//! R^T M Phi and Phi^T M Phi.
 //!
 //! Any consistent units work, for example meters, kilograms, pascals and seconds. Nothing here panics: a beam that has
 //! no length, no section or no stiffness is an error.
@@ -28,7 +28,7 @@ mod station;
 #[cfg(test)]
 mod testing;
 
-pub use beam::{Beam, BeamElement, BeamModes};
+pub use beam::{Beam, BeamElement, BeamModes, ModalInertia};
 pub use error::{BeamError, Result};
 pub use inertia::RigidInertia;
 pub use profile::{ElasticConstants, Profile};

@@ -29,20 +29,25 @@ impl Beam {
         let (points, other_points) = (self.shape_points(), other.shape_points());
         let squared_size = |points: &[Vector3<f64>]| points.iter().map(Vector3::norm_squared).sum::<f64>();
         let scale = (squared_size(&other_points) / squared_size(&points)).sqrt();
-        let covariance: Matrix3<f64> =
-            points.iter().zip(&other_points).map(|(point, other_point)| other_point * point.transpose()).sum();
-        let rotation = nearest_rotation(&covariance)?;
         let size = other_points.iter().map(Vector3::norm).fold(0.0, f64::max);
-        let distance = |(point, other): (&Vector3<f64>, &Vector3<f64>)| (rotation * point * scale - other).norm();
-        let largest_distance = points.iter().zip(&other_points).map(distance).fold(0.0, f64::max);
+        let pairs = || points.iter().zip(&other_points);
+        // Most beams that differ are found without the rotation, which takes longer.
+        let has_similar_norms =
+            pairs().all(|(point, other)| (scale * point.norm() - other.norm()).abs() <= tolerance * size);
         let has_similar_sections = |(a, b): (&BeamElement, &BeamElement)| {
             let pairs = dimensions(&a.profile).into_iter().zip(dimensions(&b.profile));
             std::mem::discriminant(&a.profile) == std::mem::discriminant(&b.profile)
                 && pairs.into_iter().all(|(a, b)| (scale * a - b).abs() <= tolerance * b)
         };
-        let is_similar = scale.is_finite()
-            && largest_distance <= tolerance * size
+        let may_be_similar = scale.is_finite()
+            && has_similar_norms
             && self.elements().iter().zip(other.elements()).all(has_similar_sections);
+        if !may_be_similar {
+            return None;
+        }
+        let covariance: Matrix3<f64> = pairs().map(|(point, other)| other * point.transpose()).sum();
+        let rotation = nearest_rotation(&covariance)?;
+        let is_similar = pairs().all(|(point, other)| (rotation * point * scale - other).norm() <= tolerance * size);
         is_similar.then_some(Similarity { rotation, scale })
     }
 

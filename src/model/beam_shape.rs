@@ -1,7 +1,7 @@
 //! Shapes that follow beams: a vertex at the offset d from the center of its section moves by u = w(s) + theta(s) x d,
 //! where w and theta are the displacement and rotation of the section.
 
-use modalcast_beam::{Beam, BeamModes, Station};
+use modalcast_beam::{Beam, BeamModes, ModalInertia, RigidInertia, Station};
 use nalgebra::Vector3;
 
 use crate::domain::{Inertia, Modes};
@@ -35,14 +35,12 @@ pub(crate) fn lift_modes(
     Modes::from_columns(rows, rank, columns)
 }
 
-/// The mass properties of a beam whose nodes are in the frame of the domain.
+/// The mass properties of a beam whose nodes are in the frame of the domain: those of the beam as a rigid body, and of its
+/// modes.
 ///
 /// # Errors
 /// `Invalid` if a number is not finite.
-pub(crate) fn inertia_of(beam: &Beam, modes: &BeamModes) -> Result<Inertia> {
-    let momenta = beam.modal_momenta(modes);
-    let masses = beam.modal_masses(modes);
-    let body = beam.rigid_inertia();
+pub(crate) fn inertia_of(body: &RigidInertia, ModalInertia { momenta, masses }: &ModalInertia) -> Result<Inertia> {
     let tensor = body.tensor();
     let moments = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)].map(|index| tensor[index]);
     // The transposes in column-major order are the matrices in row-major order.
@@ -95,14 +93,15 @@ mod tests {
         let mut beam = curved_beam();
         beam.carry(Station { element: 5, fraction: 1.0 }, RigidInertia::point_mass(0.5));
         let modes = beam.solve_modes(5).expect("a converged solution");
-        let matrix = inertia_of(&beam, &modes).expect("valid masses").mass_matrix();
+        let modal_inertia = beam.modal_inertia(&modes);
+        let matrix = inertia_of(&beam.rigid_inertia(), &modal_inertia).expect("valid masses").mass_matrix();
         assert!((matrix.view((0, 0), (6, 6)) - beam.rigid_inertia().matrix()).amax() < 1e-12);
-        assert!((matrix.view((0, 6), (6, 5)) - beam.modal_momenta(&modes)).amax() < 1e-12);
-        assert!((matrix.view((6, 6), (5, 5)) - beam.modal_masses(&modes)).amax() < 1e-12);
+        assert!((matrix.view((0, 6), (6, 5)) - modal_inertia.momenta).amax() < 1e-12);
+        assert!((matrix.view((6, 6), (5, 5)) - modal_inertia.masses).amax() < 1e-12);
         // The modes are normalized with the carried body, which is not part of the masses.
         assert!((matrix.view((6, 6), (5, 5)) - DMatrix::<f64>::identity(5, 5)).amax() > 0.1);
         let no_modes = beam.solve_modes(0).expect("no modes");
-        let rigid = inertia_of(&beam, &no_modes).expect("valid masses");
+        let rigid = inertia_of(&beam.rigid_inertia(), &beam.modal_inertia(&no_modes)).expect("valid masses");
         assert_eq!((rigid.rank(), rigid.mass_matrix()), (0, matrix.view((0, 0), (6, 6)).into_owned()));
     }
 }

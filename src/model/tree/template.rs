@@ -105,7 +105,7 @@ impl PartTemplate {
     pub(super) fn build_shape(&self) -> Result<(Shape, Metadata)> {
         let beam = self.beam()?;
         let beam_modes = beam.solve_modes(self.rank).map_err(beam_fault)?;
-        let inertia = Some(inertia_of(&beam, &beam_modes)?);
+        let inertia = Some(inertia_of(&beam.rigid_inertia(), &beam.modal_inertia(&beam_modes))?);
         let mut modes = Modes::rigid();
         if self.rank > 0 {
             let parts = self.elements_per_ring();
@@ -210,7 +210,7 @@ mod tests {
         for template in templates().iter().filter(|template| template.rank > 0) {
             let beam = template.beam().expect("a valid beam");
             let modes = beam.solve_modes(template.rank).expect("a converged solution");
-            let own_mass = beam.modal_masses(&modes);
+            let own_mass = beam.modal_inertia(&modes).masses;
             let carried = |(station, body): &(Station, RigidInertia)| {
                 let motions = beam.section_motions(&modes, *station);
                 motions.tr_mul(&(body.matrix() * &motions))

@@ -1,6 +1,6 @@
 //! Beams that are divided into coupled domains, against undivided beams and frames.
 
-use modalcast_beam::{Beam, ElasticConstants, RigidInertia, Station};
+use modalcast_beam::{Beam, ElasticConstants, ModalInertia, RigidInertia, Station};
 use nalgebra::{DMatrix, DVector, Matrix6, Matrix6xX, Rotation3, SMatrix, Vector3, Vector6};
 
 use super::testing::{Branch, create_scene};
@@ -12,15 +12,15 @@ use crate::model::{DomainInertia, DomainModel, Joint, Sample};
 const MATERIAL: ElasticConstants = ElasticConstants { youngs_modulus: 1e7, shear_modulus: 4e6, density: 1000.0 };
 
 /// Vertices of a section.
-const RING: usize = 6;
+pub(crate) const RING: usize = 6;
 
 /// A straight beam along y from the origin of its frame, with the frame on its parent.
 #[derive(Clone, Copy)]
-struct BeamPart {
-    parent: Option<usize>,
-    rotation: Rotation3<f64>,
-    length: f64,
-    radius: f64,
+pub(crate) struct BeamPart {
+    pub(crate) parent: Option<usize>,
+    pub(crate) rotation: Rotation3<f64>,
+    pub(crate) length: f64,
+    pub(crate) radius: f64,
 }
 
 /// Elements of a part.
@@ -44,7 +44,7 @@ const fn tip(elements: usize) -> Station {
 
 /// The scene of parts, each with `rank` loaded-interface modes. Parents precede their children, which stand on the tip
 /// of the parent.
-fn create_model(parts: &[BeamPart], rank: usize) -> Model {
+pub(crate) fn create_model(parts: &[BeamPart], rank: usize) -> Model {
     let mut beams: Vec<Beam> = parts.iter().map(|part| create_beam(part, ELEMENTS)).collect();
     // The rigid inertia of every part and its descendants about its origin.
     let mut carried = vec![RigidInertia::zero(); parts.len()];
@@ -98,10 +98,11 @@ fn fill_domain(domain: &mut DomainModel, beam: &Beam, part: &BeamPart, rank: usi
     }
     domain.surface_sample_count = domain.samples.len();
     domain.base_sample = Some(0);
+    let ModalInertia { momenta, masses } = beam.modal_inertia(&modes);
     domain.inertia = Some(DomainInertia {
         rigid: *beam.rigid_inertia().matrix(),
-        coupling: beam.modal_momenta(&modes).column_iter().map(|column| column.into_owned()).collect(),
-        modal: beam.modal_masses(&modes),
+        coupling: momenta.column_iter().map(|column| column.into_owned()).collect(),
+        modal: masses,
     });
     (domain.eigenvalues, domain.diagonal) = (modes.eigenvalues, part.length);
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 
 use super::skin::{Joint, Skin};
 use crate::beam_shape::{inertia_of, lift_modes};
-use crate::domain::Shape;
+use crate::domain::{Mesh, Shape};
 use crate::error::Result;
 use crate::load::asset_dir::AssetDir;
 use crate::load::plant_materials::PlantMaterials;
@@ -85,7 +85,8 @@ pub(super) fn add_modes(
     let mut child_counts = vec![0_usize; bodies.len()];
     bodies.iter().filter_map(|body| body.parent).for_each(|parent| child_counts[parent] += 1);
     let copies = find_copies(&mut bodies, &child_counts);
-    carry_children(&mut bodies, &joints);
+    let own_inertias: Vec<RigidInertia> = bodies.par_iter().map(own_inertia).collect();
+    carry_children(&mut bodies, &joints, &own_inertias);
     let ranks: Vec<usize> = (0..bodies.len()).map(|index| wanted_rank(&bodies[index], child_counts[index])).collect();
     let vertices = |index: usize| parts.shapes[parts.domains[index].shape].mesh.rest_positions().len();
     let bytes = ranks.iter().enumerate().map(|(index, rank)| 12 * (rank * vertices(index)) as u64).sum();
@@ -103,7 +104,8 @@ pub(super) fn add_modes(
         .into_par_iter()
         .map(|index| match (&bodies[index].flexible, resolve(&modes, index)) {
             (Ok(flexible), Ok(modes)) => {
-                ModalBody::new(flexible, &modes, index, parts).map_err(|error| error.to_string())
+                let mesh = &parts.shapes[parts.domains[index].shape].mesh;
+                ModalBody::new(flexible, &own_inertias[index], &modes, mesh).map_err(|error| error.to_string())
             }
             (Err(reason), _) => Err(reason.clone()),
             (_, Err(reason)) => Err(reason),
@@ -146,16 +148,17 @@ fn attach_children(bodies: &mut [OrganBody], parts: &SceneParts) -> Vec<Option<J
     joints
 }
 
-/// For each leaf that carries nothing, an earlier leaf that it is a copy of. The beam of the copy becomes exactly similar.
+/// For each leaf with modes that carries nothing, an earlier leaf that it is a copy of. The beam of the copy becomes exactly
+/// similar.
 fn find_copies(bodies: &mut [OrganBody], child_counts: &[usize]) -> Vec<Option<(usize, Similarity)>> {
     let mut copies = vec![None; bodies.len()];
     let mut originals: Vec<usize> = Vec::new();
     for index in 0..bodies.len() {
-        if bodies[index].kind != OrganKind::Leaf || child_counts[index] > 0 {
+        let mode_count = bodies[index].mode_count;
+        if bodies[index].kind != OrganKind::Leaf || child_counts[index] > 0 || mode_count == Some(0) {
             continue;
         }
         let Ok(flexible) = &bodies[index].flexible else { continue };
-        let mode_count = bodies[index].mode_count;
         let comparable = originals.iter().filter(|original| bodies[**original].mode_count == mode_count);
         let similar = comparable.into_iter().find_map(|original| {
             let other = bodies[*original].flexible.as_ref().ok()?;
@@ -176,13 +179,16 @@ fn find_copies(bodies: &mut [OrganBody], child_counts: &[usize]) -> Vec<Option<(
     copies
 }
 
+/// The inertia of an organ about its origin, without that of its children. A rigid organ has none.
+fn own_inertia(body: &OrganBody) -> RigidInertia {
+    body.flexible.as_ref().map_or(RigidInertia::zero(), |flexible| flexible.beam.rigid_inertia())
+}
+
 /// Gives each beam the rigid inertia of everything beyond each of its joints, from the leaves to the root.
-fn carry_children(bodies: &mut [OrganBody], joints: &[Option<Joint>]) {
+fn carry_children(bodies: &mut [OrganBody], joints: &[Option<Joint>], own_inertias: &[RigidInertia]) {
     let mut carried = vec![RigidInertia::zero(); bodies.len()];
     for index in (0..bodies.len()).rev() {
-        let own =
-            bodies[index].flexible.as_ref().map_or(RigidInertia::zero(), |flexible| flexible.beam.rigid_inertia());
-        let total = own + carried[index];
+        let total = own_inertias[index] + carried[index];
         let Some(parent) = bodies[index].parent else { continue };
         let base = bodies[index].origin - bodies[parent].origin;
         carried[parent] = carried[parent] + total.seen_from(&Rotation3::identity(), &base);
@@ -235,11 +241,10 @@ struct ModalBody {
 }
 
 impl ModalBody {
-    fn new(flexible: &FlexibleBody, modes: &BeamModes, index: usize, parts: &SceneParts) -> Result<Self> {
+    fn new(flexible: &FlexibleBody, own_inertia: &RigidInertia, modes: &BeamModes, mesh: &Mesh) -> Result<Self> {
         let FlexibleBody { beam, skin } = flexible;
-        let mesh = &parts.shapes[parts.domains[index].shape].mesh;
         let lifted = lift_modes(beam, modes, mesh.rest_positions(), &skin.stations)?;
-        let inertia = inertia_of(beam, modes)?;
+        let inertia = inertia_of(own_inertia, &beam.modal_inertia(modes))?;
         let carried_mass: f64 = beam.carried_bodies().iter().map(|(_, body)| body.mass()).sum();
         let notes = vec![
             ("length", format!("{:.5}", beam.length())),
