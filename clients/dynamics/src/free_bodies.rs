@@ -183,14 +183,10 @@ impl FreeScenario {
         let SavedBodies { state, viewer_forces, .. } = &self.saved;
         let rotations = self.modes.middle_rotations(state);
         let mut loads = DomainLoads::none(&self.model);
-        // Newtons divided by meters per scene unit accelerate kilograms in scene units.
-        let scale = self.model.unit.recip();
-        for (load, force) in loads.coordinates.iter_mut().zip(&viewer_forces.coordinates) {
-            *load = scale * force;
-        }
+        loads.coordinates.copy_from_slice(viewer_forces.coordinates.as_slice());
         for point in viewer_forces.points() {
             let rotation = rotations[self.modes.body_of(point.domain)].inverse();
-            let force = rotation * point.force * scale;
+            let force = rotation * point.force;
             loads.add_wrench(&self.model, point.domain, &point.rest_point, &force);
         }
         if let Some(drag) = &self.drag {
@@ -198,7 +194,7 @@ impl FreeScenario {
             let time = self.options.dt * (self.next_step as f64 + 0.5);
             for (domain, force) in drag.forces(&self.model, time, velocity).into_iter().enumerate() {
                 let rotation = rotations[self.modes.body_of(domain)].inverse();
-                drag.add_to(&self.model, domain, &(rotation * force * scale), &mut loads);
+                drag.add_to(&self.model, domain, &(rotation * force), &mut loads);
             }
         }
         loads
@@ -331,7 +327,7 @@ const MAX_REPORTED_BODIES: usize = 16;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::coupled::testing::{Branch, create_scene, random_plant};
+    use crate::coupled::testing::{Branch, create_scene, in_units, random_plant};
     use crate::divergence::DivergenceCheck;
     use crate::wind::AIR_DENSITY;
 
@@ -392,6 +388,18 @@ mod tests {
         assert!((rigid.displacement() - start - velocity * (61.0 / 60.0)).norm() <= 1e-9);
         assert!(values.transforms[0][3].abs() > 0.05, "{:?}", values.transforms);
         assert!(free.saved.late_remarks.is_empty() && free.saved.returns == 0);
+    }
+
+    /// 0.5 N on 2 kg for a second, in a scene in millimeters.
+    #[test]
+    fn pulls_are_in_newtons_whatever_the_unit_of_the_scene() {
+        let model = in_units(&body(), 1e-3);
+        let mut free = scenario(&model, OPTIONS);
+        free.set_viewer_forces(&pull(&model, 0, [0.5, 0.0, 0.0])).expect("valid forces");
+        advance(&mut free, 60);
+        let velocity = free.saved.state.bodies[0].velocity();
+        assert!((velocity - Vector3::new(250.0, 0.0, 0.0)).norm() <= 1e-6, "{velocity}");
+        assert!(free.saved.late_remarks.is_empty(), "{:?}", free.saved.late_remarks);
     }
 
     /// A body that is far away returns to rest with one remark, whatever the force is.

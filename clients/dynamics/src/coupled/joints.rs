@@ -52,9 +52,12 @@ pub struct JointTree {
     pub(super) levels: Vec<Range<usize>>,
     /// Per domain: the motion of its frame.
     pub(super) frames: Vec<FrameMotion>,
+    /// The force in kg scene units/s^2 of a newton.
+    newton: f64,
 }
 
-/// Forces on the coordinates of a scene, and wrenches on the frames of its roots.
+/// Forces on the coordinates of a scene, and wrenches on the frames of its roots, in the units of the equations of motion:
+/// kilograms, scene units and seconds.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ReducedLoad {
     pub(super) coordinates: Vec<f64>,
@@ -145,7 +148,7 @@ impl JointTree {
             let DomainModel { first_coordinate, rank, .. } = *domain;
             bodies.push(Body { first_coordinate, rank, joint, children: 0..0, offset: 0 });
         }
-        Ok(Self::sorted(bodies, frames))
+        Ok(Self { newton: model.unit.recip(), ..Self::sorted(bodies, frames) })
     }
 
     /// Sorts bodies by depth. A body precedes its children in `bodies`.
@@ -182,7 +185,7 @@ impl JointTree {
             offset += rank;
         }
         frames.iter_mut().for_each(|frame| frame.body = positions[frame.body]);
-        Self { bodies: sorted, levels, frames }
+        Self { bodies: sorted, levels, frames, newton: 1.0 }
     }
 
     /// Whether a joint lets domains act on each other: some frame moves with the modes of another domain.
@@ -192,17 +195,18 @@ impl JointTree {
     }
 
     /// The forces on the coordinates that have the same effect as `loads`: the loads do the same work, because all
-    /// frames move as functions of the coordinates.
+    /// frames move as functions of the coordinates. The loads are in newtons, and the result is in kg scene units/s^2 times
+    /// scene units per unit of q, because masses are in kilograms and motions in scene units.
     pub fn reduce(&self, loads: &DomainLoads) -> Vec<f64> {
         self.reduce_to_roots(loads).coordinates
     }
 
     /// As [`Self::reduce`], with the wrenches on the frames of the roots.
     pub(super) fn reduce_to_roots(&self, loads: &DomainLoads) -> ReducedLoad {
-        let mut forces = loads.coordinates.clone();
+        let mut forces: Vec<f64> = loads.coordinates.iter().map(|force| force * self.newton).collect();
         let mut wrenches = vec![Vector6::zeros(); self.bodies.len()];
         for (frame, wrench) in self.frames.iter().zip(&loads.wrenches) {
-            self.add_wrench(frame, wrench, &mut forces, &mut wrenches);
+            self.add_wrench(frame, &(wrench * self.newton), &mut forces, &mut wrenches);
         }
         self.sweep_to_roots(forces, wrenches)
     }

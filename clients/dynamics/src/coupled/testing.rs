@@ -191,3 +191,25 @@ pub(crate) fn random_plant(count: usize, seed: u64) -> Model {
     let branches: Vec<Branch> = depths.iter().enumerate().map(branch).collect();
     create_scene(&branches, &parents, seed)
 }
+
+/// The same scene with lengths in units of `unit` meters instead of meters. Its coordinates are larger by 1 / `unit`.
+pub(crate) fn in_units(model: &Model, unit: f64) -> Model {
+    let mut model = model.clone();
+    let scale = unit.recip();
+    // Mass properties have a factor for each of their rows and columns that is a rotation.
+    let factors = Vector6::new(1.0, 1.0, 1.0, scale, scale, scale);
+    for domain in &mut model.domains {
+        domain.placement.translation *= scale;
+        domain.joint.iter_mut().for_each(|joint| joint.parent_from_child.translation *= scale);
+        domain.follow.iter_mut().for_each(|follow| follow.leader_from_follower.translation *= scale);
+        domain.samples.iter_mut().for_each(|sample| sample.rest_position *= scale);
+        (domain.area, domain.diagonal) = (domain.area * scale * scale, domain.diagonal * scale);
+        if let Some(DomainInertia { rigid, coupling, .. }) = &mut domain.inertia {
+            rigid.component_mul_assign(&(factors * factors.transpose()));
+            coupling.iter_mut().for_each(|momentum| momentum.component_mul_assign(&factors));
+        }
+    }
+    model.bounds_min *= scale;
+    model.bounds_max *= scale;
+    Model { unit, ..model }
+}

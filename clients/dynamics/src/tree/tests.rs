@@ -1,5 +1,5 @@
 use super::*;
-use crate::coupled::testing::random_plant;
+use crate::coupled::testing::{in_units, random_plant};
 use crate::divergence::DivergenceCheck;
 use crate::hierarchy::tests::four_domain_model;
 
@@ -149,6 +149,31 @@ fn held_force_deflects_all_ancestors_as_the_static_response() {
     }
     // Control: domains that are not coupled would leave the root at rest.
     assert!(response.q[..model.domains[0].rank].iter().any(|q| *q != 0.0));
+}
+
+/// Forces are in newtons: a scene in millimeters moves by as many meters as the same scene in meters.
+#[test]
+fn motion_does_not_depend_on_the_unit_of_the_scene() {
+    let meters = random_plant(12, 4);
+    let run = |model: &Model| {
+        let mut tree = TreeScenario::new(model.clone(), OPTIONS).expect("a valid scenario");
+        let mut loads = DomainLoads::none(model);
+        let sample = model.domains[7].samples[24].clone();
+        loads.add_force(model, 7, &sample, &Vector3::new(1e-3, 2e-3, -1e-3));
+        tree.set_viewer_forces(&loads).expect("a scenario with forces");
+        let mut values = StepValues::default();
+        (0..60).for_each(|_| tree.compute_next_step(&mut values).expect("a step"));
+        (values.q.iter().map(|q| f64::from(*q) * model.unit).collect::<Vec<f64>>(), tree.peaks().drag)
+    };
+    let ((expected, drag), (q, scaled_drag)) = (run(&meters), run(&in_units(&meters, 1e-3)));
+    let largest = expected.iter().fold(0.0_f64, |largest, q| largest.max(q.abs()));
+    for (expected, q) in expected.iter().zip(&q) {
+        assert!((expected - q).abs() <= 1e-5 * largest, "{expected} {q}");
+    }
+    assert!((scaled_drag / drag - 1.0).abs() <= 1e-9, "{drag} {scaled_drag}");
+    // Control: other units of the same numbers are another scene.
+    let (other, _) = run(&Model { unit: 1e-3, ..meters });
+    assert!(other.iter().zip(&expected).any(|(a, b)| (a - b).abs() > 0.1 * largest));
 }
 
 /// The largest forces that the server passes on, for 20 s, in the direction of the motion of each coordinate, which
