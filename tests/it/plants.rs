@@ -10,15 +10,16 @@ use modalcast_client::{
     Attribute, Client, Delivery, Force, ForceKind, ForceRequest, SceneDescription, ShapeArray, SurfaceForce,
     VertexRequest, VertexSelection,
 };
-use modalcast_dynamics::coupled::StaticSystem;
+use modalcast_dynamics::coupled::{CoupledModes, StaticSystem};
 use modalcast_dynamics::deflection::{VertexForce, VertexName, report_deflections};
+use modalcast_dynamics::integrator::{Integrator as _, LoadChange, MotionState};
 use modalcast_dynamics::loads::DomainLoads;
 use modalcast_dynamics::model::Model;
-use modalcast_dynamics::parameters::ModalParameters;
+use modalcast_dynamics::parameters::{ModalParameters, ModeParameters};
 use modalcast_dynamics::run::{RunOptions, drive_scene};
 use modalcast_dynamics::tree::{TreeOptions, TreeScenario};
 use modalcast_model::load::SceneRepository;
-use nalgebra::Vector3;
+use nalgebra::{DVector, Vector3};
 
 use crate::deformers::TestRng;
 use crate::real::input_path;
@@ -241,4 +242,44 @@ async fn held_force_deflects_the_tree_as_static() {
 async fn real_held_force_deflects_the_almond_as_static() {
     let plant = open_almond().await;
     assert_held_force_deflects_as_static(&plant, |name| name.starts_with("shoot "), [0.02, 0.0, 0.0]).await;
+}
+
+/// Largest relative change of the energy of an undamped scene that moves freely, in steps of 1/60 s. All modes start with
+/// about the same energy.
+fn measure_energy_drift(mut model: Model, steps: usize) -> f64 {
+    model.domains.iter_mut().for_each(|domain| drop(domain.notes.insert("damping_ratio".into(), "0".into())));
+    let parameters = ModalParameters::read(&model).expect("expected eigenvalues");
+    let modes = CoupledModes::new(&model, &parameters, 1.0 / 60.0).expect("expected a valid scene");
+    let mut random = TestRng(45);
+    let amplitude = |mode: &Option<ModeParameters>| mode.map_or(0.0, |mode| 0.1 / mode.eigenvalue.sqrt());
+    let q = parameters.modes.iter().map(|mode| amplitude(mode) * f64::from(random.next()));
+    let mut state = MotionState::resting(DVector::from_iterator(model.coordinate_count, q));
+    let start = modes.energy(&model, &state);
+    let none = DVector::zeros(model.coordinate_count);
+    let mut drift = 0.0_f64;
+    for step in 1..=steps {
+        modes.advance(&mut state, LoadChange { start: &none, end: &none }).expect("expected a step");
+        if step % 100 == 0 {
+            drift = drift.max((modes.energy(&model, &state) / start - 1.0).abs());
+        }
+    }
+    println!("{}: {} coordinates, {steps} steps: energy drift {drift:.1e}", model.scene, model.coordinate_count);
+    assert!(state.v.norm() > 0.0, "expected a motion");
+    drift
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "needs the real inputs: MODALCAST_DATA or ../shared/data"]
+async fn real_undamped_almond_conserves_energy() {
+    let model = open_almond().await.model().await;
+    assert!(model.coordinate_count >= 4500, "expected at least 4,500 coordinates, got {}", model.coordinate_count);
+    let drift = measure_energy_drift(model, 2000);
+    assert!(drift <= 1e-9, "expected a drift of at most 1e-9, got {drift:e}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "the long run of the test above: minutes"]
+async fn undamped_almond_conserves_energy_over_1e5_steps() {
+    let drift = measure_energy_drift(open_almond().await.model().await, 100_000);
+    assert!(drift <= 1e-9, "expected a drift of at most 1e-9, got {drift:e}");
 }

@@ -306,7 +306,7 @@ impl FreeModes {
 
     /// The kinetic and elastic energy of all bodies.
     pub fn energy(&self, model: &Model, state: &FreeState) -> f64 {
-        let (q, v) = (&state.motion.q, state.motion.v.as_slice());
+        let v = state.motion.v.as_slice();
         let root_motion = |(body, rigid): (&FreeBody, &RigidState)| {
             // The velocity of the center of mass at rest without that of the deformation.
             let rotation = rigid.rotation().inverse();
@@ -317,11 +317,7 @@ impl FreeModes {
         };
         let roots: Vec<Vector6<f64>> = self.bodies.iter().zip(&state.bodies).map(root_motion).collect();
         let frames = self.modes.tree.frame_motions_from(&roots, v);
-        let kinetic: f64 =
-            model.domains.iter().zip(&frames).map(|(domain, frame)| domain.kinetic_energy(frame, domain.q(v))).sum();
-        let elastic =
-            q.iter().zip(&self.modes.modes).map(|(q, mode)| mode.map_or(0.0, |mode| 0.5 * mode.stiffness * q * q));
-        kinetic + elastic.sum::<f64>()
+        self.modes.energy_with_frames(model, &state.motion, &frames)
     }
 }
 

@@ -103,6 +103,20 @@ impl CoupledModes {
         &self.tree
     }
 
+    /// The kinetic and elastic energy of a state.
+    pub fn energy(&self, model: &Model, state: &MotionState) -> f64 {
+        self.energy_with_frames(model, state, &self.tree.frame_motions(state.v.as_slice()))
+    }
+
+    /// As [`Self::energy`]. `frames` has the motion of the frame of each domain per second.
+    fn energy_with_frames(&self, model: &Model, state: &MotionState, frames: &[Vector6<f64>]) -> f64 {
+        let velocities = state.v.as_slice();
+        let kinetic = model.domains.iter().zip(frames);
+        let kinetic = kinetic.map(|(domain, frame)| domain.kinetic_energy(frame, domain.q(velocities)));
+        let elastic = |(q, mode): (&f64, &Option<ModeTerms>)| mode.map_or(0.0, |mode| 0.5 * mode.stiffness * q * q);
+        kinetic.sum::<f64>() + state.q.iter().zip(&self.modes).map(elastic).sum::<f64>()
+    }
+
     /// The indices of all coordinates: in the order of bodies, and in the scene.
     fn coordinates(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
         let bodies = self.tree.bodies.iter();

@@ -56,19 +56,6 @@ fn drawn_velocities(model: &Model) -> DMatrix<f64> {
     DMatrix::from_columns(&columns)
 }
 
-/// The energy of a state, by the motion of all frames.
-fn energy(model: &Model, modes: &CoupledModes, state: &MotionState) -> f64 {
-    let frames = modes.joints().frame_motions(state.v.as_slice());
-    let kinetic_energy: f64 = model
-        .domains
-        .iter()
-        .zip(&frames)
-        .map(|(domain, frame)| domain.kinetic_energy(frame, domain.q(state.v.as_slice())))
-        .sum();
-    let elastic = |(q, mode): (&f64, &Option<ModeTerms>)| mode.map_or(0.0, |mode| 0.5 * mode.stiffness * q * q);
-    kinetic_energy + state.q.iter().zip(&modes.modes).map(elastic).sum::<f64>()
-}
-
 /// Advances a free motion.
 fn advance_freely(modes: &CoupledModes, state: &mut MotionState, steps: u64) {
     let none = DVector::zeros(state.q.len());
@@ -198,20 +185,20 @@ fn undamped_plant_conserves_energy() {
     for dt in [1.0 / 60.0, 2.0] {
         let modes = CoupledModes::new(&model, &parameters, dt).expect("a valid scene");
         let mut state = MotionState::resting(random_q(&model, 6, 0.01));
-        let start = energy(&model, &modes, &state);
+        let start = modes.energy(&model, &state);
         let mut drift = 0.0_f64;
         for _ in 0..40 {
             advance_freely(&modes, &mut state, 25);
-            drift = drift.max((energy(&model, &modes, &state) / start - 1.0).abs());
+            drift = drift.max((modes.energy(&model, &state) / start - 1.0).abs());
         }
         assert!(drift <= 1e-11, "dt {dt}: {drift}");
     }
     // Control: damping.
     let modes = CoupledModes::new(&model, &self::parameters(&model, 1e-4), 1.0 / 60.0).expect("a valid scene");
     let mut state = MotionState::resting(random_q(&model, 6, 0.01));
-    let start = energy(&model, &modes, &state);
+    let start = modes.energy(&model, &state);
     advance_freely(&modes, &mut state, 1000);
-    assert!(energy(&model, &modes, &state) < (1.0 - 1e-3) * start);
+    assert!(modes.energy(&model, &state) < (1.0 - 1e-3) * start);
 }
 
 #[test]
@@ -220,11 +207,11 @@ fn undamped_plant_conserves_energy_over_a_hundred_thousand_steps() {
     let model = random_plant(60, 5);
     let modes = CoupledModes::new(&model, &parameters(&model, 0.0), 1.0 / 60.0).expect("a valid scene");
     let mut state = MotionState::resting(random_q(&model, 6, 0.01));
-    let start = energy(&model, &modes, &state);
+    let start = modes.energy(&model, &state);
     let mut drift = 0.0_f64;
     for _ in 0..100 {
         advance_freely(&modes, &mut state, 1000);
-        drift = drift.max((energy(&model, &modes, &state) / start - 1.0).abs());
+        drift = drift.max((modes.energy(&model, &state) / start - 1.0).abs());
     }
     println!("{} coordinates, 1e5 steps: largest relative drift {drift:e}", model.coordinate_count);
     assert!(drift <= 1e-9, "{drift}");
@@ -339,9 +326,9 @@ fn extreme_scenes_conserve_energy() {
         for dt in [1e-6, 1.0 / 60.0, 10.0] {
             let modes = CoupledModes::new(&model, &parameters(&model, 0.0), dt).expect("a valid scene");
             let mut state = MotionState::resting(random_q(&model, 1, 1e-3));
-            let start = energy(&model, &modes, &state);
+            let start = modes.energy(&model, &state);
             advance_freely(&modes, &mut state, 20);
-            let ratio = energy(&model, &modes, &state) / start;
+            let ratio = modes.energy(&model, &state) / start;
             assert!((ratio - 1.0).abs() <= 1e-6, "{count} domains of mass {}, dt {dt}: {ratio}", mass(0));
         }
     }
@@ -358,9 +345,9 @@ fn domains_without_inertia_and_held_modes_move_as_massless_frames() {
     let mut state = MotionState::resting(random_q(&model, 2, 0.1));
     // A held mode does not move.
     state.q.rows_mut(6, 3).fill(0.0);
-    let start = energy(&model, &modes, &state);
+    let start = modes.energy(&model, &state);
     advance_freely(&modes, &mut state, 500);
-    assert!((energy(&model, &modes, &state) / start - 1.0).abs() <= 1e-11);
+    assert!((modes.energy(&model, &state) / start - 1.0).abs() <= 1e-11);
     assert_eq!(state.q.rows(6, 3).amax(), 0.0);
     assert!(state.q.rows(0, 6).amin() > 1e-6, "{}", state.q);
     // A heavier leaf slows the trunk down.
