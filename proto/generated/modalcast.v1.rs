@@ -5793,6 +5793,10 @@ pub struct CreateViewerLinkResponse {
     /// append "&scene=" and the name of a scene, or "#scene=" if the path has no fragment.
     #[prost(string, tag = "1")]
     pub url_path: ::prost::alloc::string::String,
+    /// URLs to which `url_path` is appended: that of a proxy in front of the server (`serve --public-url`), those for browsers
+    /// on the server's machine, and those for browsers on other machines, which need TLS.
+    #[prost(string, repeated, tag = "2")]
+    pub urls: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoResponse {

@@ -326,11 +326,11 @@ pub(super) fn print_addresses(listener: &Listener) -> Result<()> {
     if let Some(url) = listener.admin_url() {
         print_line(format!("health and metrics at {url}"));
     }
-    for link in listener.viewer_links()? {
-        print_line(format!("viewer at {link}"));
+    for url in listener.viewer_urls() {
+        print_line(format!("viewer at {}", listener.viewer_link(&url)?));
     }
-    for link in listener.remote_viewer_links()? {
-        print_line(format!("viewer from another machine at {link}"));
+    for url in listener.remote_viewer_urls() {
+        print_line(format!("viewer from another machine at {}", listener.viewer_link(&url)?));
     }
     for command in tunnel_commands(listener) {
         print_line(format!("viewer from another machine: run '{command}' there, then open this URL"));

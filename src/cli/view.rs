@@ -252,7 +252,8 @@ fn scene_link(link: &str, scene: &str) -> String {
 
 /// A link to the viewer.
 fn viewer_link(listener: &Listener) -> Result<String> {
-    listener.viewer_links()?.into_iter().next().ok_or_else(|| fault("view", "expected a link to the viewer"))
+    let url = listener.viewer_urls().into_iter().next();
+    listener.viewer_link(&url.ok_or_else(|| fault("view", "expected a URL of the viewer"))?)
 }
 
 fn start_physics(

@@ -19,6 +19,8 @@ use modalcast_model::error::{Error, invalid};
 pub(super) struct ServerServiceImpl {
     pub(super) engine: Engine,
     pub(super) authenticator: Arc<Authenticator>,
+    /// See `CreateViewerLinkResponse.urls`.
+    pub(super) viewer_urls: Vec<String>,
 }
 
 #[tonic::async_trait]
@@ -80,7 +82,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             false => self.find_principal(&name, &principal).map_err(to_status)?,
         };
         let url_path = self.authenticator.viewer_url_path(&credential).map_err(to_status)?;
-        Ok(Response::new(v1::CreateViewerLinkResponse { url_path }))
+        Ok(Response::new(v1::CreateViewerLinkResponse { url_path, urls: self.viewer_urls.clone() }))
     }
 }
 

@@ -200,34 +200,31 @@ impl Listener {
         self.addresses.iter().copied().filter(|address| !address.ip().is_loopback())
     }
 
-    /// New links to the viewer for the user of the server: at the public URL, and in browsers on this machine, in the order
-    /// of the addresses. Each is valid once. Empty if the viewer is off.
-    ///
-    /// # Errors
-    /// `Fault` when the system has no random numbers.
-    pub fn viewer_links(&self) -> Result<Vec<String>> {
+    /// The URLs of the viewer: the public one, and those for browsers on this machine, in the order of the addresses. Empty
+    /// if the viewer is off.
+    pub fn viewer_urls(&self) -> Vec<String> {
         let public_url = self.public_url.iter().filter(|_| self.has_viewer).map(ToString::to_string);
-        let local_urls = self.viewer_addresses().map(|address| format!("{}://{address}", self.scheme()));
-        public_url.chain(local_urls).map(|url| self.viewer_link(&url)).collect()
+        public_url.chain(self.viewer_addresses().map(|address| format!("{}://{address}", self.scheme()))).collect()
     }
 
-    fn viewer_link(&self, url: &str) -> Result<String> {
-        Ok(url.to_owned() + &self.authenticator.viewer_url_path(self.authenticator.directory().owner())?)
-    }
-
-    /// New links to the viewer for browsers on other machines, without those of the public URL. Empty if the viewer is off,
-    /// or the server encrypts nothing.
-    ///
-    /// # Errors
-    /// `Fault` when the system has no random numbers.
-    pub fn remote_viewer_links(&self) -> Result<Vec<String>> {
+    /// The URLs of the viewer for browsers on other machines, without the public one. Empty if the viewer is off, or the
+    /// server encrypts nothing.
+    pub fn remote_viewer_urls(&self) -> Vec<String> {
         let host = |address: SocketAddr| match address.ip().is_unspecified() {
             true => format!("{}:{}", host_name().unwrap_or_else(|| "HOST".into()), address.port()),
             false => address.to_string(),
         };
         let is_offered = self.has_viewer && self.is_encrypted();
         let addresses = self.remote_addresses().filter(|_| is_offered);
-        addresses.map(|address| self.viewer_link(&format!("https://{}", host(address)))).collect()
+        addresses.map(|address| format!("https://{}", host(address))).collect()
+    }
+
+    /// A new link to the viewer at one of its URLs, for the user of the server. It is valid once.
+    ///
+    /// # Errors
+    /// `Fault` when the system has no random numbers.
+    pub fn viewer_link(&self, url: &str) -> Result<String> {
+        Ok(url.to_owned() + &self.authenticator.viewer_url_path(self.authenticator.directory().owner())?)
     }
 
     /// The URL at which programs of this user reach the server: a Unix socket or, without one, a TCP socket.

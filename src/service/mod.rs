@@ -92,7 +92,8 @@ pub async fn serve(
     health.set(true).await;
     let shared_memory = SharedMemory::default();
     let authenticator = Arc::clone(&listener.authenticator);
-    let routes = routes(&engine, &config, &shared_memory, &authenticator)?.with(health_server);
+    let viewer_urls = [listener.viewer_urls(), listener.remote_viewer_urls()].concat();
+    let routes = routes(&engine, &config, &shared_memory, &authenticator, viewer_urls)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
     let web = config.viewer.then(|| {
         let host_name = host_name().filter(|_| accepts_machines);
@@ -227,6 +228,7 @@ fn routes(
     config: &Config,
     shared_memory: &SharedMemory,
     authenticator: &Arc<Authenticator>,
+    viewer_urls: Vec<String>,
 ) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
@@ -255,6 +257,7 @@ fn routes(
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
             engine: engine.clone(),
             authenticator: Arc::clone(authenticator),
+            viewer_urls,
         })))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
         .with(with_limits!(StepServiceServer::new(step_service)))

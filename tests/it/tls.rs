@@ -410,8 +410,10 @@ async fn public_url_begins_the_links_of_the_viewer() {
         ..Config::default()
     };
     let listener = service::bind(&config).await.expect("expected a free port");
-    let links = listener.viewer_links().expect("expected links");
-    assert!(links[0].starts_with("https://lab.example/render/#code=") && links[1].starts_with("http://127.0.0.1:"));
+    let urls = listener.viewer_urls();
+    assert!(urls[0] == "https://lab.example/render" && urls[1].starts_with("http://127.0.0.1:"), "{urls:?}");
+    let link = listener.viewer_link(&urls[0]).expect("expected a link");
+    assert!(link.starts_with("https://lab.example/render/#code="), "{link}");
 }
 
 /// A key that others could read, that of another certificate, and files without a certificate.

@@ -29,8 +29,8 @@ async fn post_code(server: &Server, code: &str) -> Answer {
 
 /// The token of a session with the rights of a role.
 async fn new_session(guarded: &GuardedServer, role: Role) -> String {
-    let path = client(guarded, role).await.create_viewer_link("").await.expect("expected a link");
-    let answer = post_code(&guarded.server, code_of(&path)).await;
+    let link = client(guarded, role).await.create_viewer_link("").await.expect("expected a link");
+    let answer = post_code(&guarded.server, code_of(&link.url_path)).await;
     assert_eq!(answer.status, 200, "{answer:?}");
     String::from_utf8(answer.body).expect("expected a token")
 }
@@ -64,8 +64,9 @@ async fn session_has_the_rights_of_the_principal_of_its_link() {
 #[tokio::test(flavor = "multi_thread")]
 async fn code_is_valid_once_and_wrong_sessions_close_the_connection() {
     let guarded = GuardedServer::start().await;
-    let path = client(&guarded, Role::View).await.create_viewer_link("").await.expect("expected a link");
-    let code = code_of(&path);
+    let link = client(&guarded, Role::View).await.create_viewer_link("").await.expect("expected a link");
+    assert_eq!(link.urls, std::slice::from_ref(&guarded.server.address));
+    let code = code_of(&link.url_path);
     assert_eq!(code.len(), 64);
     let other_site = format!(
         "POST /session HTTP/1.1\r\nHost: localhost\r\nOrigin: http://evil.example\r\nContent-Length: 64\r\n\r\n{code}"
@@ -88,8 +89,8 @@ async fn code_is_valid_once_and_wrong_sessions_close_the_connection() {
 async fn only_admins_make_links_for_others() {
     let guarded = GuardedServer::start().await;
     let admin = client(&guarded, Role::Admin).await;
-    let path = admin.create_viewer_link("pixels").await.expect("expected a link");
-    let answer = post_code(&guarded.server, code_of(&path)).await;
+    let link = admin.create_viewer_link("pixels").await.expect("expected a link");
+    let answer = post_code(&guarded.server, code_of(&link.url_path)).await;
     let mut websocket = WebSocketClient::connect(&guarded.server).await;
     websocket.send(0, SESSION, &answer.body).await;
     assert_eq!(call(&mut websocket, UPLOAD).await, Code::PermissionDenied, "expected the rights of 'pixels'");

@@ -58,7 +58,7 @@ def test_calls_steps_and_streams_are_encrypted(server: EncryptedServer):
             step = drive.step()
             assert next(state for state in steps if state.step == step)
         link = tree.view()
-    assert link.url.startswith(f"{server.address}/?token=")
+    assert link.url.startswith(f"{server.address}/#code=")
     context = ssl.create_default_context(cafile=str(server.certificate))
     with urllib.request.urlopen(link.url, context=context) as reply:
         assert reply.status == 200

@@ -225,15 +225,16 @@ impl Client {
     }
 
     /// Makes a link to the viewer, which is valid once. `principal` is the one whose rights the link gives; empty: the
-    /// caller's own. Returns the path and fragment, to which the caller prepends scheme, host and port of the server.
+    /// caller's own. Returns the path and fragment, and the URLs to which the caller may append them: scheme, host and port
+    /// of the server as this client knows it do as well.
     ///
     /// # Errors
     /// `Status` if the server has no viewer, or the caller may not name this principal; `Connect` if the connection is
     /// lost.
-    pub async fn create_viewer_link(&self, principal: &str) -> Result<String> {
+    pub async fn create_viewer_link(&self, principal: &str) -> Result<v1::CreateViewerLinkResponse> {
         let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
         let request = v1::CreateViewerLinkRequest { principal: principal.to_owned() };
-        self.reply(service.create_viewer_link(request).await).map(|reply| reply.url_path)
+        self.reply(service.create_viewer_link(request).await)
     }
 
     /// Shares a scene with the principals of these names (`"*"`: all), in place of those with whom it was shared. Others

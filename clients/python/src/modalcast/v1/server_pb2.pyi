@@ -39,10 +39,12 @@ class CreateViewerLinkRequest(_message.Message):
     def __init__(self, principal: _Optional[str] = ...) -> None: ...
 
 class CreateViewerLinkResponse(_message.Message):
-    __slots__ = ("url_path",)
+    __slots__ = ("url_path", "urls")
     URL_PATH_FIELD_NUMBER: _ClassVar[int]
+    URLS_FIELD_NUMBER: _ClassVar[int]
     url_path: str
-    def __init__(self, url_path: _Optional[str] = ...) -> None: ...
+    urls: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, url_path: _Optional[str] = ..., urls: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
     __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features", "viewer_url_path")

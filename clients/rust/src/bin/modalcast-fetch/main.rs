@@ -34,8 +34,8 @@ async fn run_command(arguments: &Cli) -> Result<()> {
         Command::Reset { scene, take_over } => client.reset_scene(scene, *take_over).await.map(drop),
         Command::Close { scene } => client.delete_scene(scene).await,
         Command::Link { principal, scene } => {
-            let path = client.create_viewer_link(principal).await?;
-            output::print_link(&arguments.server, &path, scene.as_deref());
+            let link = client.create_viewer_link(principal).await?;
+            output::print_links(&arguments.server, &link, scene.as_deref());
             Ok(())
         }
         Command::Share { scene, principals } => {

@@ -212,15 +212,16 @@ fn scene_json(scene: &SceneInfo) -> Value {
     })
 }
 
-/// Prints a link to the viewer. `server` is the URL that the user has named. The path of a server without authentication
-/// has no fragment.
-pub(crate) fn print_link(server: &str, path: &str, scene: Option<&str>) {
-    let separator = if path.contains('#') { '&' } else { '#' };
+/// Prints a link to the viewer at each address that browsers may use. From another machine, that is the URL of the server
+/// that the user has named.
+pub(crate) fn print_links(server: &str, link: &v1::CreateViewerLinkResponse, scene: Option<&str>) {
+    let separator = if link.url_path.contains('#') { '&' } else { '#' };
     let scene = scene.map(|scene| format!("{separator}scene={scene}")).unwrap_or_default();
-    match server.starts_with("unix:") {
-        // A browser cannot open a socket.
-        true => println!("http://HOST:PORT{path}{scene}"),
-        false => println!("{}{path}{scene}", server.trim_end_matches('/')),
+    let is_here =
+        ["unix:", "http://127.", "http://localhost", "http://[::1]"].iter().any(|start| server.starts_with(start));
+    let named = [server.trim_end_matches('/').to_owned()];
+    for url in if is_here && !link.urls.is_empty() { &link.urls[..] } else { &named } {
+        println!("{url}{}{scene}", link.url_path);
     }
 }
 
