@@ -49,7 +49,7 @@ pub use scene::{
     AlphaMode, Attachment, Domain, Follow, Inertia, Material, MaterialRange, SceneDescription, Shape, ShapeArray,
     Texture,
 };
-pub use server_address::ConnectOptions;
+pub use server_address::{ConnectOptions, TOKEN_FILE_VARIABLE};
 pub use stages::{StageSamples, StageTimes};
 pub use states::{
     SceneState, SentValues, StateDecoder, StateLayout, StateRequest, StateStream, StateStreamOptions,

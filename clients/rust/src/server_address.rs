@@ -10,7 +10,7 @@ use tonic::transport::{Certificate, ClientTlsConfig, Identity};
 use crate::error::{Error, Result};
 
 /// The environment variable with the path of a file that contains a token.
-const TOKEN_FILE_VARIABLE: &str = "MODALCAST_TOKEN_FILE";
+pub const TOKEN_FILE_VARIABLE: &str = "MODALCAST_TOKEN_FILE";
 
 /// The environment variable with the path of a file that contains the certificates of authorities.
 const CA_FILE_VARIABLE: &str = "MODALCAST_CA_FILE";

@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use modalcast_client::{Client, SceneInfo, ServerInfo};
+use modalcast_client::{Client, SceneInfo, ServerInfo, TOKEN_FILE_VARIABLE};
 use serde::Serialize;
 use serde_json::Value;
 use tempfile::TempDir;
@@ -17,6 +17,7 @@ use super::motion::Motion;
 use super::processes::{Process, Program, arguments};
 use super::{QUICK_DIVISOR, SCENE, StreamReportOptions, peers, skeletons};
 use crate::workloads::Size;
+use modalcast::config::Config;
 use modalcast_model::backend_settings::LookTable;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{self, OpenedScene};
@@ -268,8 +269,12 @@ fn start_server(work: &Path, repository: Option<&Path>, draws: bool, backend: Se
     let state = work.join("state");
     let unix_address = format!("unix:{}", unix_socket(work).display());
     let mut list = arguments([&"serve", &"--listen", &"127.0.0.1:0", &"--listen", &unix_address, &"--state", &state]);
-    // With authentication, the clients of this report would use the Unix socket in place of TCP.
-    list.extend(arguments([&"--no-auth", &"--shared-memory", &shared_memory_socket(work)]));
+    match std::env::var_os(TOKEN_FILE_VARIABLE) {
+        Some(token_file) => copy_token(Path::new(&token_file), &state)?,
+        // With authentication, clients without a token would use the Unix socket in place of TCP.
+        None => list.extend(arguments([&"--no-auth"])),
+    }
+    list.extend(arguments([&"--shared-memory", &shared_memory_socket(work)]));
     if let Some(repository) = repository {
         list.extend(arguments([&"--scenes", &repository]));
     }
@@ -280,4 +285,12 @@ fn start_server(work: &Path, repository: Option<&Path>, draws: bool, backend: Se
         list.extend(arguments([&"--renderer", &"off"]));
     }
     Process::start(Program::Server, &list)
+}
+
+/// Lets the server accept the token that the clients of the report read from a file.
+fn copy_token(token_file: &Path, state: &Path) -> Result<()> {
+    let own_file = Config { state: state.to_owned(), ..Config::default() }.token_file();
+    std::fs::create_dir_all(state).map_err(fault_in("report"))?;
+    std::fs::copy(token_file, own_file).map_err(fault_in("report"))?;
+    Ok(())
 }
