@@ -10,7 +10,8 @@ use modalcast::cli::{Completion, Outcome, print_line};
 const EXAMPLES: &str = "Examples:
   modalcast report dynamics --out report
   modalcast report dynamics --out report --quick
-  modalcast report dynamics --out report --scenes ../data";
+  modalcast report dynamics --out report --scenes ../data
+  modalcast report dynamics --out report --case plants";
 
 /// Error against step and time of the time integrators, and of the modes that modalcast model computes: oscillators in
 /// closed form, a beam, cubic forces, extreme cases, and solids with known frequencies. Then the time of a step of plants
@@ -29,6 +30,9 @@ pub(super) struct Args {
     /// Folder of scenes that contains vega/simpleBridge and plants/almond. Default: only generated systems.
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
+    /// Measure only this case; repeatable.
+    #[arg(long = "case", value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(dynamics::CASES))]
+    cases: Vec<String>,
     /// Fewer steps, modes and freedoms.
     #[arg(long)]
     quick: bool,
@@ -37,7 +41,7 @@ pub(super) struct Args {
 /// Runs the report.
 pub(super) fn run(args: &Args) -> Outcome {
     let size = if args.quick { Size::Quick } else { Size::Full };
-    let options = DynamicsReportOptions { scenes: args.scenes.clone(), size };
+    let options = DynamicsReportOptions { scenes: args.scenes.clone(), cases: args.cases.clone(), size };
     let on_progress = |progress: DynamicsProgress<'_>| match progress {
         DynamicsProgress::Started(case) => {
             tracing::info!(case, "measuring");

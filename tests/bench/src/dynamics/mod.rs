@@ -50,6 +50,8 @@ use modalcast_model::error::Result;
 pub struct DynamicsReportOptions {
     /// Folder with `vega/simpleBridge` and `plants/almond`. Without it, only generated systems are measured.
     pub scenes: Option<PathBuf>,
+    /// The names in [`CASES`] to measure. Empty for all.
+    pub cases: Vec<String>,
     pub size: Size,
 }
 
@@ -81,7 +83,7 @@ pub enum DynamicsProgress<'a> {
 }
 
 /// The cases in the order of the report.
-const CASES: [&str; 8] = [
+pub const CASES: [&str; 8] = [
     oscillators::SINGLE_MODES,
     oscillators::STIFF_SYSTEM,
     beam::CASE,
@@ -100,8 +102,10 @@ pub fn measure(
     options: &DynamicsReportOptions,
     mut progress: impl FnMut(DynamicsProgress<'_>) -> Result<()>,
 ) -> Result<DynamicsReport> {
-    let (mut report, mut errors) = (DynamicsReport::new(), Vec::new());
-    for case in CASES {
+    let is_selected = |case: &&str| options.cases.is_empty() || options.cases.iter().any(|name| name == case);
+    let selected: Vec<&str> = CASES.into_iter().filter(is_selected).collect();
+    let (mut report, mut errors) = (DynamicsReport::new(&selected), Vec::new());
+    for case in selected {
         progress(DynamicsProgress::Started(case))?;
         errors.extend(report.measure_case(case, options).err().map(|error| format!("{case}: {error}")));
         report.recommendations = recommendation::recommend(&report.rows, &report.solids);
@@ -114,11 +118,11 @@ pub fn measure(
 
 impl DynamicsReport {
     /// A report without results.
-    fn new() -> Self {
+    fn new(cases: &[&'static str]) -> Self {
         Self {
             provenance: Provenance::collect(),
             remarks: Vec::new(),
-            missing: CASES.to_vec(),
+            missing: cases.to_vec(),
             rows: Vec::new(),
             references: Vec::new(),
             solids: Vec::new(),

@@ -324,9 +324,9 @@ fn frequencies_of_a_wrong_reference_are_a_failure() {
 
 #[test]
 fn missing_bridge_is_a_remark_or_a_failure() {
-    let mut report = DynamicsReport::new();
+    let mut report = DynamicsReport::new(&CASES);
     let measure = |report: &mut DynamicsReport, scenes: Option<&Path>| {
-        let options = DynamicsReportOptions { scenes: scenes.map(Into::into), size: Size::Quick };
+        let options = DynamicsReportOptions { scenes: scenes.map(Into::into), cases: vec![], size: Size::Quick };
         report.measure_case(cubic::BRIDGE, &options)
     };
     measure(&mut report, None).expect("a skipped case");
@@ -339,7 +339,7 @@ fn missing_bridge_is_a_remark_or_a_failure() {
 
 #[test]
 fn files_are_complete_and_parse() {
-    let mut report = DynamicsReport::new();
+    let mut report = DynamicsReport::new(&CASES);
     report.rows = rows_at_one_hertz(false);
     report.rows.push(measured_row(cubic::CHAIN, AVERAGE_VECTOR_FIELD, 60.0, 1e-3, 10.0));
     report.rows.extend([10.0, 20.0].map(|per_second| measured_row(beam::CASE, Method::Exact, per_second, 1e-3, 2.0)));
