@@ -43,9 +43,9 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
-        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let principal = Caller::of(&request)?.principal;
+        let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle =
             self.engine.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
@@ -101,9 +101,9 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
-        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let principal = Caller::of(&request)?.principal;
+        let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
+        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);

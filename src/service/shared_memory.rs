@@ -4,7 +4,8 @@
 //! A connection to that socket owns slots for replies and slots for steps, whose memory is bounded: at most
 //! [`MAX_CONNECTIONS`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies.
 //! The copied values of a step count as those of a step in several messages. A call without a free slot for a reply
-//! waits until its client returns one or the connection ends.
+//! waits until its client returns one or the connection ends. The first call that uses a connection binds it to the
+//! principal of the call.
 
 mod reply_memory;
 mod request_memory;
@@ -13,7 +14,7 @@ use std::collections::HashMap;
 use std::io::{self, IoSlice};
 use std::mem::MaybeUninit;
 use std::os::fd::{AsFd as _, BorrowedFd, OwnedFd};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -29,6 +30,7 @@ use tonic::metadata::MetadataMap;
 use self::reply_memory::{ReplyMemory, SLOT_BYTES, SLOT_COUNT};
 use self::request_memory::RequestMemory;
 use crate::engine::lock;
+use crate::identity::Principal;
 use modalcast_model::error::{Result, invalid};
 
 /// Limit on the connections. A further one is closed.
@@ -58,6 +60,8 @@ struct ConnectionMemory {
     requests: RequestMemory,
     /// Returns the slots of `requests` to the client.
     returns: OwnedWriteHalf,
+    /// The name of the principal whose calls may use this memory, once there has been a call.
+    principal: OnceLock<String>,
 }
 
 /// Accepts connections until it is dropped. Then all of them end.
@@ -74,16 +78,25 @@ impl SharedMemory {
         SharedMemoryServer(tokio::spawn(accept_connections(listener, self.clone())))
     }
 
-    /// The memory that a call asks for.
+    /// The memory that a call of a principal asks for.
     ///
     /// # Errors
-    /// `Invalid` if the metadata have another value than the token of an open connection.
-    pub(super) fn find(&self, metadata: &MetadataMap) -> Result<CallMemory> {
+    /// `Invalid` if the metadata have another value than the token of an open connection, or if another principal uses
+    /// this connection.
+    pub(super) fn find(&self, metadata: &MetadataMap, principal: &Principal) -> Result<CallMemory> {
         let Some(value) = metadata.get_bin(TOKEN_KEY) else { return Ok(CallMemory::default()) };
         let token = value.to_bytes().ok().and_then(|bytes| Token::try_from(&*bytes).ok());
         let connection = token.and_then(|token| lock(&self.connections).get(&token).cloned());
+        let own = connection.filter(|connection| connection.belongs_to(principal));
         let unknown = || invalid(TOKEN_KEY, "the token of an open connection for shared memory", "another value");
-        connection.map(|connection| CallMemory(Some(connection))).ok_or_else(unknown)
+        own.map(|connection| CallMemory(Some(connection))).ok_or_else(unknown)
+    }
+}
+
+impl ConnectionMemory {
+    /// Whether the calls of a principal may use this memory. The first principal who asks may.
+    fn belongs_to(&self, principal: &Principal) -> bool {
+        *self.principal.get_or_init(|| principal.name.clone()) == principal.name
     }
 }
 
@@ -170,7 +183,7 @@ async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: OwnedSe
     let mut token = Token::default();
     getrandom::fill(&mut token).map_err(io::Error::other)?;
     let (mut slots, returns) = socket.into_split();
-    let registration = Registration::new(memory, token, ConnectionMemory { replies, requests, returns });
+    let registration = Registration::new(memory, token, ConnectionMemory { replies, requests, returns, principal: OnceLock::new() });
     send_handshake(slots.as_ref(), token, [reply_file, request_file]).await?;
     loop {
         match slots.read_u32_le().await {
@@ -245,6 +258,7 @@ mod tests {
     use tonic::metadata::MetadataValue;
 
     use super::*;
+    use crate::identity::Role;
     use crate::service::status::to_status;
 
     #[test]
@@ -260,7 +274,7 @@ mod tests {
         let (replies, _) = ReplyMemory::new(permit).expect("expected memory");
         let (requests, _) = RequestMemory::new().expect("expected memory");
         let (socket, client) = UnixStream::pair().expect("expected sockets");
-        (ConnectionMemory { replies, requests, returns: socket.into_split().1 }, client)
+        (ConnectionMemory { replies, requests, returns: socket.into_split().1, principal: OnceLock::new() }, client)
     }
 
     #[tokio::test]
@@ -286,14 +300,27 @@ mod tests {
         assert!(CallMemory::default().receive(&mut v1::Step::default()).is_ok());
     }
 
+    fn find(memory: &SharedMemory, token: &[u8], principal: &Principal) -> Result<CallMemory, Code> {
+        let mut metadata = MetadataMap::new();
+        metadata.insert_bin(TOKEN_KEY, MetadataValue::from_bytes(token));
+        memory.find(&metadata, principal).map_err(|error| to_status(error).code())
+    }
+
+    #[tokio::test]
+    async fn memory_belongs_to_the_principal_who_used_it_first() {
+        let memory = SharedMemory::default();
+        let _registrations = [[7; 16], [8; 16]].map(|token| Registration::new(&memory, token, new_connection().0));
+        let anna = Principal { name: "anna".into(), role: Role::Drive };
+        assert!(find(&memory, &[7; 16], &anna).is_ok() && find(&memory, &[7; 16], &anna).is_ok());
+        assert_eq!(find(&memory, &[7; 16], &Principal::owner()).err(), Some(Code::InvalidArgument));
+        assert!(find(&memory, &[8; 16], &Principal::owner()).is_ok());
+        assert_eq!(find(&memory, &[8; 16], &anna).err(), Some(Code::InvalidArgument));
+    }
+
     #[tokio::test]
     async fn memory_is_found_by_its_token_while_it_is_registered() {
         let memory = SharedMemory::default();
-        let find = |token: &[u8]| {
-            let mut metadata = MetadataMap::new();
-            metadata.insert_bin(TOKEN_KEY, MetadataValue::from_bytes(token));
-            memory.find(&metadata).map_err(|error| to_status(error).code())
-        };
+        let find = |token: &[u8]| find(&memory, token, &Principal::owner());
         let registration = Registration::new(&memory, [7; 16], new_connection().0);
         let call_memory = find(&[7; 16]).expect("expected the memory");
         let mut data = Bytes::from(vec![1; SLOT_BYTES]);
@@ -305,7 +332,7 @@ mod tests {
         assert_eq!(find(&[7; 16]).err(), Some(Code::InvalidArgument));
         let mut kept = Bytes::from(vec![1; SLOT_BYTES]);
         assert!(call_memory.share(&mut kept).await.is_none() && kept.len() == SLOT_BYTES);
-        let no_metadata = memory.find(&MetadataMap::new()).expect("expected no error");
+        let no_metadata = memory.find(&MetadataMap::new(), &Principal::owner()).expect("expected no error");
         assert!(no_metadata.share(&mut kept).await.is_none() && kept.len() == SLOT_BYTES);
     }
 }

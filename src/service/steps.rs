@@ -46,7 +46,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
-        let memory = self.shared_memory.find(request.metadata()).map_err(to_status)?;
+        let memory = self.shared_memory.find(request.metadata(), &caller.principal).map_err(to_status)?;
         let session = DriveSession {
             engine: self.engine.clone(),
             caller,
