@@ -64,7 +64,8 @@ pub struct StageTime {
 /// 1. The client maps the first memfd read-only and shared, and the second one, if it sends steps, writable and
 ///    shared. Each has the same number of slots, and slot n begins at n times the size of a slot.
 /// 1. The client starts a call with the token as the metadata `modalcast-shared-memory-bin`, which is 16 binary bytes;
-///    gRPC encodes them. A token that belongs to no open connection is rejected with REASON_INVALID_FIELD.
+///    gRPC encodes them. The first call decides whose calls may use the token: those of its principal. A token that
+///    belongs to no open connection, or to another principal, is rejected with REASON_INVALID_FIELD.
 /// 1. Replies: the server puts data of 64 KiB or more into a free slot, and sends the chunk with `shared`. The client
 ///    copies or uses the data, and then returns the slot: it sends the number of the slot as u32 on the socket. The
 ///    server does not write to a slot between these messages.
@@ -5789,14 +5790,17 @@ pub struct CreateViewerLinkRequest {
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CreateViewerLinkResponse {
-    /// The path and fragment of the link. A client prepends the scheme, host and port at which it reaches this server, and may
-    /// append "&scene=" and the name of a scene, or "#scene=" if the path has no fragment.
+    /// The path and fragment of the link. A client prepends `public_url` or, if that is empty, the scheme, host and port at
+    /// which it reaches this server. It may append "&scene=" and the name of a scene, or "#scene=" if the path has no fragment.
     #[prost(string, tag = "1")]
     pub url_path: ::prost::alloc::string::String,
     /// URLs to which `url_path` is appended: that of a proxy in front of the server (`serve --public-url`), those for browsers
     /// on the server's machine, and those for browsers on other machines, which need TLS.
     #[prost(string, repeated, tag = "2")]
     pub urls: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The URL of a proxy in front of the server, which is also in `urls`; empty without one.
+    #[prost(string, tag = "3")]
+    pub public_url: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoResponse {

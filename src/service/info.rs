@@ -82,7 +82,8 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             false => self.find_principal(&name, &principal).map_err(to_status)?,
         };
         let url_path = self.authenticator.viewer_url_path(&credential).map_err(to_status)?;
-        Ok(Response::new(v1::CreateViewerLinkResponse { url_path, urls: self.viewer_urls.clone() }))
+        let public_url = self.engine.config().public_url.as_ref().map(ToString::to_string).unwrap_or_default();
+        Ok(Response::new(v1::CreateViewerLinkResponse { url_path, urls: self.viewer_urls.clone(), public_url }))
     }
 }
 

@@ -12,6 +12,7 @@ import pytest
 from conftest import SERVER_ARGUMENTS
 
 import modalcast as mc
+from modalcast.v1 import server_pb2
 from modalcast.viewer import viewer_link
 
 
@@ -39,6 +40,15 @@ def test_server_without_viewer_is_unavailable():
             tree.view()
 
 
+def test_link_begins_with_the_public_url():
+    arguments = [*SERVER_ARGUMENTS, "--public-url", "https://lab.example/render"]
+    with mc.spawn(arguments=arguments) as client:
+        link = client.open("tree").view()
+        assert link.url.startswith("https://lab.example/render/#code="), link.url
+        assert link.url.endswith("&scene=tree"), link.url
+
+
 def test_unix_socket_is_rejected():
+    reply = server_pb2.CreateViewerLinkResponse(url_path="/#code=0")
     with pytest.raises(mc.Unavailable, match="got a Unix socket"):
-        viewer_link("unix:/run/modalcast", "/#code=0", "tree", 600)
+        viewer_link("unix:/run/modalcast", reply, "tree", 600)

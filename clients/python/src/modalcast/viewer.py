@@ -13,6 +13,7 @@ from urllib.parse import quote
 
 from modalcast._channel import is_encrypted, target_of
 from modalcast.errors import Unavailable
+from modalcast.v1 import server_pb2
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,18 @@ class ViewerLink:
         return f'<iframe src="{url}" style="{style}" title="modalcast viewer" allow="clipboard-write"></iframe>'
 
 
-def viewer_link(address: str, url_path: str, scene: str, height: int) -> ViewerLink:
-    """The viewer of a scene on the server at an address of a client.
+def viewer_link(address: str, reply: server_pb2.CreateViewerLinkResponse, scene: str, height: int) -> ViewerLink:
+    """The viewer of a scene at the public URL of its server or, without one, at the address of a client.
 
     Raises:
         Unavailable: The address is a Unix socket, which browsers cannot use.
     """
+    separator = "&" if "#" in reply.url_path else "#"
+    url_path = f"{reply.url_path}{separator}scene={quote(scene)}"
+    if reply.public_url:
+        return ViewerLink(reply.public_url + url_path, height)
     target = target_of(address)
     if target.startswith("unix:"):
         raise Unavailable(f"{address}: expected an address HOST:PORT, which browsers can use, got a Unix socket")
-    separator = "&" if "#" in url_path else "#"
     scheme = "https" if is_encrypted(address) else "http"
-    return ViewerLink(f"{scheme}://{target}{url_path}{separator}scene={quote(scene)}", height)
+    return ViewerLink(f"{scheme}://{target}{url_path}", height)

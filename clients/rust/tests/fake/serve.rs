@@ -83,7 +83,7 @@ impl ServerService for FakeService {
         request: Request<v1::CreateViewerLinkRequest>,
     ) -> Result<Response<v1::CreateViewerLinkResponse>, Status> {
         let url_path = format!("/#code={}", request.into_inner().principal);
-        Ok(Response::new(v1::CreateViewerLinkResponse { url_path, urls: Vec::new() }))
+        Ok(Response::new(v1::CreateViewerLinkResponse { url_path, ..Default::default() }))
     }
 
     async fn get_server_info(

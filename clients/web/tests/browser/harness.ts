@@ -5,7 +5,7 @@ import { mkdirSync, mkdtempSync, readFileSync, rmSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join, resolve } from "node:path";
 import { gunzipSync } from "node:zlib";
-import { type Browser, type ConsoleMessage, chromium, type Page } from "playwright-core";
+import { type Browser, type BrowserContextOptions, type ConsoleMessage, chromium, type Page } from "playwright-core";
 import WebSocket from "ws";
 import type { App } from "../../src/app";
 import { ContentCache } from "../../src/source/content_cache";
@@ -142,7 +142,7 @@ export function printedUrl(server: ChildProcess, prefix: string): Promise<string
         let output = "";
         server.stdout?.on("data", (text) => {
             output += text;
-            const found = new RegExp(`${prefix} (http:\\S+)`).exec(output);
+            const found = new RegExp(`${prefix} (https?:\\S+)`).exec(output);
             if (found?.[1]) done(found[1]);
         });
         server.once("exit", (code) => fail(new Error(`the server has ended with code ${code}: ${log.slice(-2000)}`)));
@@ -183,8 +183,15 @@ export interface ViewerPage {
     errors: string[];
 }
 
-export async function openPage(browser: Browser, url: string, width = 480, height = 300): Promise<ViewerPage> {
-    const page = await browser.newPage({ viewport: { width, height } });
+/** `options`: further properties of the page's browser context. */
+export async function openPage(
+    browser: Browser,
+    url: string,
+    width = 480,
+    height = 300,
+    options: BrowserContextOptions = {},
+): Promise<ViewerPage> {
+    const page = await browser.newPage({ viewport: { width, height }, ...options });
     page.setDefaultTimeout(TIMEOUT_MS);
     const errors: string[] = [];
     page.on("pageerror", (error) => errors.push(String(error)));

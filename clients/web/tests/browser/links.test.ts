@@ -2,9 +2,21 @@
 
 import assert from "node:assert/strict";
 import { execFileSync } from "node:child_process";
+import { networkInterfaces } from "node:os";
 import { after, before, test } from "node:test";
 import type { Browser, Page } from "playwright-core";
-import { launchBrowser, openPage, programPath, ServerProcess, takeScreenshot, waitForScene } from "./harness";
+import {
+    end,
+    launchBrowser,
+    openPage,
+    printedUrl,
+    programPath,
+    ServerProcess,
+    startProgram,
+    takeScreenshot,
+    temporaryFolder,
+    waitForScene,
+} from "./harness";
 
 const LIMIT_MS = 120_000;
 const server = new ServerProcess("", [], true);
@@ -72,4 +84,29 @@ test("a page without a link needs one, also after a restart of the server", { ti
     await page.goto(`${newLink()}&scene=tree`);
     await page.getByText("This page needs a new link").first().waitFor({ state: "hidden" });
     await page.close();
+});
+
+/** The address of this machine on its network or, without one, its loopback address. */
+function networkAddress(): string {
+    const addresses = Object.values(networkInterfaces()).flatMap((list) => list ?? []);
+    return addresses.find(({ family, internal }) => family === "IPv4" && !internal)?.address ?? "127.0.0.1";
+}
+
+test("a phone opens the printed link of a server with TLS", { timeout: LIMIT_MS }, async () => {
+    const options = ["--listen", "0.0.0.0:0", "--tls-self-signed", "--backend", "cpu", "--state", temporaryFolder()];
+    const encrypted = startProgram("modalcast", ["serve", ...options], ["ignore", "pipe", "pipe"]);
+    const link = new URL(await printedUrl(encrypted, "viewer from another machine at"));
+    assert.equal(link.protocol, "https:");
+    // The name of this machine needs not be known here.
+    link.hostname = networkAddress();
+    const phone = { isMobile: true, hasTouch: true, deviceScaleFactor: 2 };
+    // Whoever uses a self-signed certificate accepts it in the browser.
+    const { page, errors } = await openPage(browser, link.href, 390, 844, { ...phone, ignoreHTTPSErrors: true });
+    await openTree(page);
+    await takeScreenshot(page, "phone-tls");
+    assert.deepEqual(errors, []);
+    await page.close();
+    // Control: the browser does not trust the certificate by itself.
+    await assert.rejects(openPage(browser, link.href), /ERR_CERT_AUTHORITY_INVALID/);
+    await end(encrypted);
 });

@@ -148,7 +148,7 @@ class Scene:
         """
         request = server_pb2.CreateViewerLinkRequest()
         reply = await self._transport.unary(CREATE_VIEWER_LINK, request, self._time_limit(timeout))
-        return viewer_link(self.client.address, reply.url_path, self.name, height)
+        return viewer_link(self.client.address, reply, self.name, height)
 
     async def describe(
         self,

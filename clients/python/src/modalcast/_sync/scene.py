@@ -150,7 +150,7 @@ class Scene:
         """
         request = server_pb2.CreateViewerLinkRequest()
         reply = self._transport.unary(CREATE_VIEWER_LINK, request, self._time_limit(timeout))
-        return viewer_link(self.client.address, reply.url_path, self.name, height)
+        return viewer_link(self.client.address, reply, self.name, height)
 
     def describe(
         self,

@@ -39,12 +39,14 @@ class CreateViewerLinkRequest(_message.Message):
     def __init__(self, principal: _Optional[str] = ...) -> None: ...
 
 class CreateViewerLinkResponse(_message.Message):
-    __slots__ = ("url_path", "urls")
+    __slots__ = ("url_path", "urls", "public_url")
     URL_PATH_FIELD_NUMBER: _ClassVar[int]
     URLS_FIELD_NUMBER: _ClassVar[int]
+    PUBLIC_URL_FIELD_NUMBER: _ClassVar[int]
     url_path: str
     urls: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, url_path: _Optional[str] = ..., urls: _Optional[_Iterable[str]] = ...) -> None: ...
+    public_url: str
+    def __init__(self, url_path: _Optional[str] = ..., urls: _Optional[_Iterable[str]] = ..., public_url: _Optional[str] = ...) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
     __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features", "viewer_url_path")
