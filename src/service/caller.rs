@@ -5,18 +5,25 @@ use std::sync::Arc;
 use tonic::{Request, Status};
 
 use super::connection::ConnectionInfo;
+use super::reply_budget::CallReplies;
 use super::status::{internal_fault, to_status};
 use crate::identity::{Credential, Principal};
 
-/// The credential with which a call was admitted, in the extensions of its request. `None` for a method that requires none.
+/// What [`super::routes`] gives a call: it is in the extensions of the request.
 #[derive(Clone)]
-pub(super) struct CallCredential(pub(super) Option<Arc<Credential>>);
+pub(super) struct AdmittedCall {
+    /// `None` for a method that requires none.
+    pub(super) credential: Option<Arc<Credential>>,
+    pub(super) replies: Arc<CallReplies>,
+}
 
 /// Who makes a call.
 #[derive(Debug, Clone)]
 pub(super) struct Caller {
     pub(super) principal: Arc<Principal>,
     pub(super) credential: Arc<Credential>,
+    /// Counts the replies of the call.
+    pub(super) replies: Arc<CallReplies>,
     /// Address of the client, for the log.
     pub(super) peer: String,
 }
@@ -25,10 +32,11 @@ impl Caller {
     /// # Errors
     /// `INTERNAL` for a request that was not admitted with a credential.
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, Status> {
-        let credential = request.extensions().get::<CallCredential>().and_then(|credential| credential.0.as_ref());
-        let credential = Arc::clone(credential.ok_or_else(|| internal_fault("expected a call with a credential"))?);
+        let call = request.extensions().get::<AdmittedCall>().cloned();
+        let AdmittedCall { credential, replies } = call.ok_or_else(|| internal_fault("expected an admitted call"))?;
+        let credential = credential.ok_or_else(|| internal_fault("expected a call with a credential"))?;
         let peer = ConnectionInfo::of(request).map_err(to_status)?.peer().to_owned();
-        Ok(Self { principal: Arc::clone(credential.principal()), credential, peer })
+        Ok(Self { principal: Arc::clone(credential.principal()), credential, replies, peer })
     }
 
     /// Logs a change of a scene, and whether it has succeeded.

@@ -12,6 +12,7 @@ use tonic::{Response, Status};
 
 use super::MAX_REPLY_BYTES;
 use super::convert::{parse_hashes, wire_scene_info};
+use super::reply_budget::CallReplies;
 use super::status::to_status;
 use super::stream::{ReplySender, ReplyStream, respond};
 use crate::engine::{ContentHash, ContentHashes, SceneContent, SceneHandle, ShapeArray, hex, run_blocking};
@@ -25,13 +26,14 @@ const CHUNK_HEAD_BYTES: usize = 64;
 /// Replies with the descriptions of the selected domains and of everything that they use, and with the requested
 /// arrays.
 pub(super) fn respond_with_description(
+    replies: Arc<CallReplies>,
     scene_handle: Arc<SceneHandle>,
     request: v1::DescribeSceneRequest,
     max_chunk_bytes: usize,
 ) -> Result<Response<ReplyStream<v1::DescribeSceneResponse>>> {
     let selection = Arc::new(Selection::new("domains", request.domains, scene_handle.scene.domains.len())?);
     let arrays = parse_arrays(&request.arrays)?;
-    Ok(respond(move |reply_sender| async move {
+    Ok(respond(replies, move |reply_sender| async move {
         reply_sender.send(response_with(Part::Scene(wire_scene_info(&scene_handle)))).await?;
         let hashes = match request.hashes {
             true => Some(scene_handle.content_hashes().await.map_err(to_status)?),
@@ -126,6 +128,7 @@ async fn send_array(
 
 /// Replies with arrays and textures by their hashes.
 pub(super) async fn respond_with_content(
+    replies: Arc<CallReplies>,
     scene_handle: Arc<SceneHandle>,
     request: v1::ReadContentRequest,
     max_chunk_bytes: usize,
@@ -140,7 +143,7 @@ pub(super) async fn respond_with_content(
         hashes.find(hash).ok_or_else(not_found)
     };
     let items: Vec<SceneContent> = requested_hashes.iter().enumerate().map(find_content).collect::<Result<_>>()?;
-    Ok(respond(move |reply_sender: ReplySender<v1::ReadContentResponse>| async move {
+    Ok(respond(replies, move |reply_sender: ReplySender<v1::ReadContentResponse>| async move {
         for (item, content) in items.into_iter().enumerate() {
             let size = content.size(&scene_handle.scene);
             for start in (0..size.max(1)).step_by(max_chunk_bytes) {
@@ -156,6 +159,7 @@ pub(super) async fn respond_with_content(
 
 /// Replies with rows of one domain's U: three per requested vertex.
 pub(super) fn respond_with_modes(
+    replies: Arc<CallReplies>,
     scene_handle: Arc<SceneHandle>,
     request: v1::ReadModesRequest,
     max_chunk_bytes: usize,
@@ -173,7 +177,7 @@ pub(super) fn respond_with_modes(
     // the reply.
     let vertices_per_chunk = if rank == 0 { selection.len() } else { (max_chunk_bytes / bytes_per_vertex).max(1) };
     let total = (bytes_per_vertex * selection.len()) as u64;
-    Ok(respond(move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
+    Ok(respond(replies, move |reply_sender: ReplySender<v1::ReadModesResponse>| async move {
         let modes = &scene_handle.scene.shape_of(request.domain as usize).modes;
         for first in (0..selection.len()).step_by(vertices_per_chunk) {
             let chunk_vertices = vertices_per_chunk.min(selection.len() - first);

@@ -42,13 +42,13 @@ impl v1::force_service_server::ForceService for ForceServiceImpl {
         request: Request<v1::StreamForcesRequest>,
     ) -> Result<Response<Self::StreamForcesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let delivery = parse_stream_delivery(v1::Delivery::Latest.into(), request.max_hz).map_err(to_status)?;
         let right_ended = scene_handle.right_ended(&principal, SceneRight::Use);
         let subscription = ForceSubscription::new(scene_handle, delivery, request.passive).map_err(to_status)?;
-        Ok(respond(move |reply_sender| {
+        Ok(respond(replies, move |reply_sender| {
             let work = run_while_permitted(right_ended, send_reports(subscription, reply_sender));
             deadline.enforce("the stream of forces", work)
         }))

@@ -43,7 +43,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
@@ -53,7 +53,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Still).map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let (max_chunk_bytes, encoder) = (config.chunk_bytes, self.engine.encoder().clone());
-        Ok(respond(move |reply_sender| async move {
+        Ok(respond(replies, move |reply_sender| async move {
             let work = async {
                 let _pixels = connection.acquire_frame_pixels(count_pixels(&pictures)).await.map_err(to_status)?;
                 let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
@@ -77,8 +77,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     async fn pick(&self, request: Request<v1::PickRequest>) -> Result<Response<Self::PickStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let principal = Caller::of(&request)?.principal;
-        picks::respond_to_pick(&self.engine, &principal, deadline, request.into_inner()).await
+        let caller = Caller::of(&request)?;
+        picks::respond_to_pick(&self.engine, caller, deadline, request.into_inner()).await
     }
 
     async fn update_frame_stream(
@@ -101,7 +101,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
@@ -128,7 +128,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             _pixels: pixels,
         };
         let right_ended = scene_handle.right_ended(&principal, right);
-        Ok(respond(move |reply_sender| {
+        Ok(respond(replies, move |reply_sender| {
             let work = run_while_permitted(right_ended, frame_stream.run(frames, reply_sender));
             deadline.enforce("the frame stream", work)
         }))

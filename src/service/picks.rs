@@ -4,11 +4,11 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 use tonic::Status;
 
+use super::caller::Caller;
 use super::convert::{describe_step_selector, parse_pick, parse_step_selector, wire_stages, wire_step_id};
 use super::status::to_status;
 use super::stream::{Deadline, ReplyStream, respond};
 use crate::engine::{Engine, ModalHit, PickResult, SceneRight, resolve_picks};
-use crate::identity::Principal;
 use modalcast_model::scene::Scene;
 
 /// Upper bound on the encoded size of a hit without its modes, in bytes.
@@ -17,15 +17,16 @@ const MAX_HIT_BYTES: usize = 256;
 /// Answers one pick request.
 pub(super) async fn respond_to_pick(
     engine: &Engine,
-    principal: &Principal,
+    caller: Caller,
     deadline: Deadline,
     request: v1::PickRequest,
 ) -> Result<tonic::Response<ReplyStream<v1::PickResponse>>, Status> {
-    let scene_handle = engine.find_opened(&request.scene, principal, SceneRight::Use).await.map_err(to_status)?;
+    let scene_handle =
+        engine.find_opened(&request.scene, &caller.principal, SceneRight::Use).await.map_err(to_status)?;
     let output_spec = parse_pick(engine, &scene_handle.scene, &request).map_err(to_status)?;
     let selector = parse_step_selector(request.step);
     let max_chunk_bytes = engine.config().chunk_bytes;
-    Ok(respond(move |reply_sender| async move {
+    Ok(respond(caller.replies, move |reply_sender| async move {
         let work = async {
             let output = scene_handle.request_output(selector, output_spec).await.map_err(to_status)?;
             let pick_result =

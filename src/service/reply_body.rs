@@ -341,7 +341,7 @@ mod tests {
 
     async fn queued(message: impl ReplyMessage) -> Result<QueuedMessage, Status> {
         let message = EncodedMessage::new(message)?;
-        let unsent = CallReplies::current().acquire(message.size()).await?;
+        let unsent = CallReplies::with_default_budgets().acquire(message.size()).await?;
         Ok(QueuedMessage { message, unsent })
     }
 

@@ -265,17 +265,6 @@ impl Drop for ConnectionReplyBudget {
 }
 
 impl CallReplies {
-    /// The replies of the current call. A call without a connection, as in tests, has a budget of its own.
-    pub(super) fn current() -> Arc<Self> {
-        let own_budget = |_| ReplyBudget::new(&Config::default()).new_connection(Arc::default()).new_call();
-        CURRENT_CALL.try_with(Arc::clone).unwrap_or_else(own_budget)
-    }
-
-    /// Runs a handler, for which these are the current replies.
-    pub(super) async fn scope<F: Future>(self: Arc<Self>, handler: F) -> F::Output {
-        CURRENT_CALL.scope(self, handler).await
-    }
-
     /// Waits for budget for a reply. Cancel-safe.
     ///
     /// # Errors
@@ -409,11 +398,6 @@ impl Drop for UnsentBytes {
     }
 }
 
-tokio::task_local! {
-    /// The call that a handler answers. [`super::routes`] sets it, so that handlers need not pass it on.
-    static CURRENT_CALL: Arc<CallReplies>;
-}
-
 /// A frame that counts until HTTP/2 drops it.
 struct CountedFrame {
     bytes: Bytes,
@@ -455,6 +439,14 @@ impl HttpBody for CountedReplyBody {
 
     fn size_hint(&self) -> SizeHint {
         self.inner.size_hint()
+    }
+}
+
+#[cfg(test)]
+impl CallReplies {
+    /// The replies of a call of a connection of its own, with the default budgets.
+    pub(super) fn with_default_budgets() -> Arc<Self> {
+        ReplyBudget::new(&Config::default()).new_connection(Arc::default()).new_call()
     }
 }
 

@@ -12,7 +12,7 @@ use tonic::server::NamedService;
 use tonic::{Code, Status};
 
 use super::authentication::{Authenticator, Denial};
-use super::caller::CallCredential;
+use super::caller::AdmittedCall;
 use super::connection::ConnectionInfo;
 use super::reply_body::replace_body;
 use super::reply_budget::CountedReplyBody;
@@ -69,7 +69,7 @@ fn with_transport_details(response: Response<Body>, max_message_bytes: usize) ->
 }
 
 impl Routes {
-    /// Calls the service that the path names, if the caller may. The request has the [`CallCredential`] in its extensions.
+    /// Calls the service that the path names, if the caller may. The request has an [`AdmittedCall`] in its extensions.
     pub(super) fn call(&self, mut request: Request<Body>) -> BoxFuture<Response<Body>, Infallible> {
         let name = request.uri().path().split('/').nth(1).unwrap_or_default();
         let Some(route) = self.by_name.get(name).cloned() else {
@@ -87,7 +87,8 @@ impl Routes {
                 });
             }
         };
-        request.extensions_mut().insert(CallCredential(credential.clone()));
+        let replies = connection.reply.new_call();
+        request.extensions_mut().insert(AdmittedCall { credential: credential.clone(), replies });
         let timeout = request.headers().get("grpc-timeout");
         let timeout = timeout.and_then(|timeout| parse_timeout(timeout.to_str().ok()?));
         let response = Box::pin(call_within_budgets(route, request, connection, credential));
@@ -127,7 +128,7 @@ async fn call_within_budgets(
     let limits = connection.receive.limits();
     let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, limits, request_call)));
     let response = tokio::select! {
-        response = connection.reply.new_call().scope(route(request)) => response,
+        response = route(request) => response,
         () = revoked(credential.clone()) => return Ok(revoked_status().into_http()),
     };
     memory.release_complete();

@@ -41,7 +41,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let opened = catch_panic(async move { engine.open(&source, &name, &principal, Some(client)).await }).await;
         let name = opened.as_ref().map_or(scene, |scene_handle| scene_handle.name.clone());
         let scene_handle = caller.log_change("OpenScene", &name, opened)?;
-        respond_once(MAX_INFO_BYTES, async move {
+        respond_once(caller.replies, MAX_INFO_BYTES, async move {
             Ok(v1::OpenSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -57,7 +57,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let (engine, principal) = (self.0.clone(), Arc::clone(&caller.principal));
         let opened = catch_panic(async move { engine.finish_upload(upload, &principal).await }).await;
         let scene_handle = caller.log_change("UploadScene", &name, opened)?;
-        respond_once(MAX_INFO_BYTES, async move {
+        respond_once(caller.replies, MAX_INFO_BYTES, async move {
             Ok(v1::UploadSceneResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -73,7 +73,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let (engine, principal) = (self.0.clone(), Arc::clone(&caller.principal));
         let opened = catch_panic(async move { engine.finish_array_upload(upload, &principal).await }).await;
         let scene_handle = caller.log_change("UploadArrays", &name, opened)?;
-        respond_once(MAX_INFO_BYTES, async move {
+        respond_once(caller.replies, MAX_INFO_BYTES, async move {
             Ok(v1::UploadArraysResponse { scene: Some(wire_scene_info(&scene_handle)) })
         })
         .await
@@ -83,19 +83,19 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<v1::FindUploadedFilesRequest>,
     ) -> Result<Response<v1::FindUploadedFilesResponse>, Status> {
-        let (engine, principal) = (self.0.clone(), Caller::of(&request)?.principal);
+        let (engine, Caller { principal, replies, .. }) = (self.0.clone(), Caller::of(&request)?);
         let sha256 = request.into_inner().sha256;
         let find = async move { engine.find_uploaded_files(parse_hashes(&sha256)?, &principal).await };
         let found = catch_panic(find).await?;
-        respond_once(MAX_INFO_BYTES, async move { Ok(v1::FindUploadedFilesResponse { found }) }).await
+        respond_once(replies, MAX_INFO_BYTES, async move { Ok(v1::FindUploadedFilesResponse { found }) }).await
     }
 
     async fn list_scenes(
         &self,
         request: Request<v1::ListScenesRequest>,
     ) -> Result<Response<v1::ListScenesResponse>, Status> {
-        let (engine, principal) = (self.0.clone(), Caller::of(&request)?.principal);
-        respond_once(MAX_LIST_BYTES, async move {
+        let (engine, Caller { principal, replies, .. }) = (self.0.clone(), Caller::of(&request)?);
+        respond_once(replies, MAX_LIST_BYTES, async move {
             let SceneList { open, opening, failed } = engine.list(&principal);
             let scenes = open.iter().map(|scene_handle| wire_scene_summary(scene_handle)).collect();
             let mut budget = ByteBudget::new(MAX_SOURCE_BYTES);
@@ -115,7 +115,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let (engine, principal, name) = (self.0.clone(), Arc::clone(&caller.principal), scene.clone());
         let closed = catch_panic(async move { engine.close(&name, &principal).await }).await;
         caller.log_change("DeleteScene", &scene, closed)?;
-        respond_once(0, async { Ok(v1::DeleteSceneResponse {}) }).await
+        respond_once(caller.replies, 0, async { Ok(v1::DeleteSceneResponse {}) }).await
     }
 
     async fn share_scene(
@@ -128,7 +128,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         let shared = catch_panic(async move { engine.share(&name, &principal, principals).await }).await;
         let SceneAccess { owner, shared_with } = caller.log_change("ShareScene", &scene, shared)?;
         let shared_with = shared_with.into_iter().collect();
-        respond_once(MAX_INFO_BYTES, async { Ok(v1::ShareSceneResponse { owner, shared_with }) }).await
+        respond_once(caller.replies, MAX_INFO_BYTES, async { Ok(v1::ShareSceneResponse { owner, shared_with }) }).await
     }
 
     type DescribeSceneStream = ReplyStream<v1::DescribeSceneResponse>;
@@ -137,10 +137,11 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<v1::DescribeSceneRequest>,
     ) -> Result<Response<Self::DescribeSceneStream>, Status> {
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
-        describe::respond_with_description(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
+        describe::respond_with_description(replies, scene_handle, request, self.0.config().chunk_bytes)
+            .map_err(to_status)
     }
 
     type ReadContentStream = ReplyStream<v1::ReadContentResponse>;
@@ -149,10 +150,12 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<v1::ReadContentRequest>,
     ) -> Result<Response<Self::ReadContentStream>, Status> {
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
-        describe::respond_with_content(scene_handle, request, self.0.config().chunk_bytes).await.map_err(to_status)
+        describe::respond_with_content(replies, scene_handle, request, self.0.config().chunk_bytes)
+            .await
+            .map_err(to_status)
     }
 
     type ReadModesStream = ReplyStream<v1::ReadModesResponse>;
@@ -161,9 +164,9 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         &self,
         request: Request<v1::ReadModesRequest>,
     ) -> Result<Response<Self::ReadModesStream>, Status> {
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
-        describe::respond_with_modes(scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
+        describe::respond_with_modes(replies, scene_handle, request, self.0.config().chunk_bytes).map_err(to_status)
     }
 }

@@ -183,7 +183,8 @@ async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: OwnedSe
     let mut token = Token::default();
     getrandom::fill(&mut token).map_err(io::Error::other)?;
     let (mut slots, returns) = socket.into_split();
-    let registration = Registration::new(memory, token, ConnectionMemory { replies, requests, returns, principal: OnceLock::new() });
+    let registration =
+        Registration::new(memory, token, ConnectionMemory { replies, requests, returns, principal: OnceLock::new() });
     send_handshake(slots.as_ref(), token, [reply_file, request_file]).await?;
     loop {
         match slots.read_u32_le().await {

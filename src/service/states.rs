@@ -39,12 +39,12 @@ impl v1::state_service_server::StateService for StateServiceImpl {
     async fn get_state(&self, request: Request<v1::GetStateRequest>) -> Result<Response<Self::GetStateStream>, Status> {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
-        Ok(respond(move |reply_sender| async move {
+        Ok(respond(replies, move |reply_sender| async move {
             let work = async {
                 let output = scene_handle.request_output(selector, OutputSpec::State).await.map_err(to_status)?;
                 let mut reply = reply_sender.reserve_whole(max_state_bytes(&scene_handle.scene)).await?;
@@ -66,7 +66,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         request: Request<v1::StreamStatesRequest>,
     ) -> Result<Response<Self::StreamStatesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
@@ -82,7 +82,7 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         let right_ended = scene_handle.right_ended(&principal, right);
         let scene = Arc::clone(&scene_handle.scene);
         let state_stream = StateStream { scene, max_chunk_bytes: self.0.config().chunk_bytes, settings };
-        Ok(respond(move |reply_sender| {
+        Ok(respond(replies, move |reply_sender| {
             let work = run_while_permitted(right_ended, state_stream.run(subscription, reply_sender));
             deadline.enforce("the stream of states", work)
         }))

@@ -4,6 +4,7 @@
 
 use std::collections::VecDeque;
 use std::pin::Pin;
+use std::sync::Arc;
 
 use modalcast_proto::v1;
 use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
@@ -47,6 +48,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let deadline = Deadline::of_stream(request.metadata());
         let memory = self.shared_memory.find(request.metadata(), &caller.principal).map_err(to_status)?;
+        let replies = Arc::clone(&caller.replies);
         let session = DriveSession {
             engine: self.engine.clone(),
             caller,
@@ -57,7 +59,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
             writer: None,
             replies: VecDeque::new(),
         };
-        Ok(respond(move |reply_sender| deadline.enforce("the step stream", session.run(reply_sender))))
+        Ok(respond(replies, move |reply_sender| deadline.enforce("the step stream", session.run(reply_sender))))
     }
 
     async fn reset_scene(

@@ -196,13 +196,12 @@ pub(super) async fn run_while_permitted(
 /// disconnects, `work` is dropped at its next await, so that its resources are released. If the client does not read
 /// while others wait for the reply budget, the call ends with `SlowReader`. The stream of the response is empty: its
 /// messages are in the body that [`with_body`] adds.
-pub(super) fn respond<T, W, F>(work: W) -> Response<ReplyStream<T>>
+pub(super) fn respond<T, W, F>(replies: Arc<CallReplies>, work: W) -> Response<ReplyStream<T>>
 where
     T: Send + 'static,
     W: FnOnce(ReplySender<T>) -> F,
     F: Future<Output = Result<(), Status>> + Send + 'static,
 {
-    let replies = CallReplies::current();
     let (messages, receiver) = mpsc::channel(REPLY_CAPACITY);
     let queue = Arc::new(ReplyQueue { messages: Mutex::new(receiver), error: Mutex::default() });
     let (_is_open, is_closed) = oneshot::channel();
@@ -272,10 +271,11 @@ pub(super) async fn catch_panic<T: Send + 'static>(
 /// Answers a unary call with the message that `build` produces, of at most `max_bytes` bytes. Waits for the reply budget
 /// first, so `build` must not wait for other clients.
 pub(super) async fn respond_once<T: ReplyMessage + Default + Send + 'static>(
+    replies: Arc<CallReplies>,
     max_bytes: usize,
     build: impl Future<Output = Result<T>> + Send + 'static,
 ) -> Result<Response<T>, Status> {
-    let unsent = CallReplies::current().acquire(max_bytes + PREFIX_BYTES).await?;
+    let unsent = replies.acquire(max_bytes + PREFIX_BYTES).await?;
     let queued = encode_within(catch_panic(build).await?, unsent)?;
     Ok(with_body(Response::new(T::default()), tokio_stream::once(Ok(queued))))
 }
@@ -431,11 +431,12 @@ mod tests {
     #[tokio::test]
     async fn work_is_dropped_when_the_client_disconnects() {
         let (work_guard, work_dropped) = tokio::sync::oneshot::channel::<()>();
-        let replies = respond(move |_: ReplySender<v1::StreamForcesResponse>| async move {
-            std::future::pending::<()>().await;
-            drop(work_guard);
-            Ok(())
-        });
+        let replies =
+            respond(CallReplies::with_default_budgets(), move |_: ReplySender<v1::StreamForcesResponse>| async move {
+                std::future::pending::<()>().await;
+                drop(work_guard);
+                Ok(())
+            });
         drop(replies);
         let result =
             tokio::time::timeout(crate::hang_guard::HANG_GUARD, work_dropped).await.expect("expected dropped work");
@@ -485,7 +486,7 @@ mod tests {
                 reply.shrink_to(60);
                 reply.send(v1::StreamForcesResponse { receiver_error: "x".repeat(50), ..Default::default() }).await
             };
-            connection.new_call().scope(async { respond(work) }).await
+            respond(connection.new_call(), work)
         };
         let unread = start_call().await;
         run_other_tasks().await;
@@ -508,7 +509,7 @@ mod tests {
             mark_built.store(true, Ordering::Relaxed);
             Ok(v1::DeleteSceneResponse {})
         };
-        let mut call = Box::pin(connection.new_call().scope(respond_once(60, build)));
+        let mut call = Box::pin(respond_once(connection.new_call(), 60, build));
         let pending = tokio::time::timeout(Duration::from_millis(50), call.as_mut()).await;
         assert!(pending.is_err() && !is_built.load(Ordering::Relaxed), "expected no reply without budget");
         drop(unread);
@@ -524,11 +525,14 @@ mod tests {
     async fn panicking_work_ends_its_stream_with_internal() {
         use http_body_util::BodyExt as _;
         let reply = |text: &str| v1::StreamForcesResponse { receiver_error: text.into(), ..Default::default() };
-        let response = respond(move |reply_sender: ReplySender<v1::StreamForcesResponse>| async move {
-            reply_sender.send(reply("first")).await?;
-            reply_sender.send(reply("second")).await?;
-            panic!("injected")
-        });
+        let response = respond(
+            CallReplies::with_default_budgets(),
+            move |reply_sender: ReplySender<v1::StreamForcesResponse>| async move {
+                reply_sender.send(reply("first")).await?;
+                reply_sender.send(reply("second")).await?;
+                panic!("injected")
+            },
+        );
         let body = take_body(response).expect("expected a body").collect().await.expect("expected frames");
         let status = Status::from_header_map(body.trailers().expect("expected trailers")).expect("expected a status");
         assert_eq!(status.code(), tonic::Code::Internal);

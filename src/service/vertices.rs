@@ -38,7 +38,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle =
@@ -47,7 +47,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let selector = parse_step_selector(request.step);
         let (packer, max_chunk_bytes) = (self.engine.vertex_packer().clone(), config.chunk_bytes);
         let to_response = |part| v1::GetVerticesResponse { part: Some(part) };
-        Ok(respond(move |reply_sender| async move {
+        Ok(respond(replies, move |reply_sender| async move {
             let work = async {
                 let spec = OutputSpec::Vertices(selection.vertex_attributes());
                 let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
@@ -72,7 +72,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         request: Request<v1::StreamVerticesRequest>,
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let principal = Caller::of(&request)?.principal;
+        let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
@@ -90,7 +90,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
             max_chunk_bytes: self.engine.config().chunk_bytes,
             max_steps: request.steps,
         };
-        Ok(respond(move |reply_sender| {
+        Ok(respond(replies, move |reply_sender| {
             let work = run_while_permitted(right_ended, vertex_stream.run(subscription, reply_sender));
             deadline.enforce("the vertex stream", work)
         }))
