@@ -9,6 +9,9 @@ use bytes::Bytes;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::load::LoadOptions;
 
+/// The largest stall budget of a writer.
+pub const MAX_STALL_BUDGET: Duration = Duration::from_secs(86_400);
+
 /// The deformation backend.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
 pub enum BackendChoice {
@@ -299,9 +302,11 @@ pub struct Config {
     pub max_subscribers: usize,
     /// Limit on the single requests that wait for a step of one scene.
     pub max_pending_requests: usize,
-    /// How long a lossless subscriber may block the writer, and how long an upload may stall. After this time the
-    /// server ends the subscription or the upload.
-    pub stall_timeout: Duration,
+    /// How long the lossless readers of a scene may make its writer wait: a budget that is refilled by a tenth of the
+    /// elapsed time. Readers that exceed it are disconnected. A writer may ask for another budget.
+    pub stall_budget: Duration,
+    /// How long an upload may make the server wait: a budget that is refilled by the received bytes.
+    pub upload_stall_budget: Duration,
     /// Time for streams to end when the server shuts down.
     pub drain_timeout: Duration,
     /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
@@ -371,7 +376,8 @@ impl Default for Config {
             max_deadline: Duration::from_secs(600),
             max_subscribers: 32,
             max_pending_requests: 64,
-            stall_timeout: Duration::from_secs(30),
+            stall_budget: Duration::from_secs(2),
+            upload_stall_budget: Duration::from_secs(30),
             drain_timeout: Duration::from_secs(8),
             connections: 1024,
             handshake_timeout: Duration::from_secs(5),
@@ -474,7 +480,8 @@ impl Config {
         check_range("connections", self.connections as u64, 1, 65536)?;
         check_range("max_deadline (ms)", ms(self.max_deadline), 1, HOUR_MS)?;
         check_range("deadline (ms)", ms(self.deadline), 1, ms(self.max_deadline))?;
-        check_range("stall_timeout (ms)", ms(self.stall_timeout), 1, HOUR_MS)?;
+        check_range("stall_budget (ms)", ms(self.stall_budget), 1, MAX_STALL_BUDGET.as_millis() as u64)?;
+        check_range("upload_stall_budget (ms)", ms(self.upload_stall_budget), 1, HOUR_MS)?;
         check_range("drain_timeout (ms)", ms(self.drain_timeout), 1, HOUR_MS)?;
         check_range("handshake_timeout (ms)", ms(self.handshake_timeout), 1, HOUR_MS)?;
         check_range("first_request_timeout (ms)", ms(self.first_request_timeout), 1, HOUR_MS)?;
@@ -522,7 +529,7 @@ mod tests {
             ("config.chunk_bytes", Config { chunk_bytes: 2 << 20, ..Config::default() }),
             ("config.window", Config { window: 300, ..Config::default() }),
             ("config.frame_side", Config { frame_side: 0, ..Config::default() }),
-            ("config.stall_timeout (ms)", Config { stall_timeout: Duration::ZERO, ..Config::default() }),
+            ("config.stall_budget (ms)", Config { stall_budget: Duration::ZERO, ..Config::default() }),
             ("config.state", Config { state: PathBuf::new(), ..Config::default() }),
         ];
         for (field, config) in invalid_configs {

@@ -90,7 +90,7 @@ pub struct SharedRange {
     pub bytes: u32,
 }
 /// Which steps a stream carries. A stream must choose, because both choices have a cost: a slow reader of every step
-/// slows down the simulation, and a stream of the newest steps skips some.
+/// slows down the simulation or, beyond OpenDrive.stall_budget_ms, is disconnected. A stream of the newest steps skips some.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Delivery {
@@ -169,7 +169,10 @@ pub enum Reason {
     LimitReached = 10,
     /// RESOURCE_EXHAUSTED: a message is larger than Limits.message_bytes.
     MessageTooLarge = 11,
-    /// RESOURCE_EXHAUSTED: the client has not read its replies in time, and the stream ends. Metadata "queue" and "limit".
+    /// RESOURCE_EXHAUSTED: the client has not read its replies in time, and the stream ends. Metadata "queue" and "limit" if
+    /// a queue or a budget of replies was full. Of a lossless stream that has used up the stall budget of the scene: metadata
+    /// "received_run" and "received_step", the last step that the stream sends completely (absent if there is none), and
+    /// "missing_run" and "missing_step", the step after it.
     SlowReader = 12,
     /// DEADLINE_EXCEEDED: the deadline expired before the reply was complete.
     DeadlineExpired = 13,
@@ -2171,6 +2174,15 @@ pub struct OpenDrive {
     pub take_over: bool,
     #[prost(enumeration = "InitialState", tag = "7")]
     pub initial_state: i32,
+    /// How long lossless subscribers may make this writer wait, in milliseconds, at most 86400000 (a day); 0:
+    /// Limits.stall_budget_ms. The budget begins full, and is refilled by a tenth of the elapsed time. Only time in which
+    /// the writer waits for clients that do not read counts, not the time in which the server computes or encodes. The wait
+    /// for a client is also counted as its own, and decreases in the same way. When the wait for a client is as long as
+    /// what is left of the budget, its streams that make the writer wait end with REASON_SLOW_READER. Therefore one client
+    /// uses at most half of the budget, and a new client less. Ignored with DELIVERY_LATEST, because such a writer does not
+    /// wait for subscribers. A writer that needs every step in a recording more than its rate asks for a large budget.
+    #[prost(uint32, tag = "8")]
+    pub stall_budget_ms: u32,
 }
 /// One step. It is applied completely or not at all. Values that are not sent remain unchanged.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -2254,6 +2266,9 @@ pub struct Opened {
     /// SceneInfo.last_step is the last step before this run.
     #[prost(message, optional, tag = "7")]
     pub scene: ::core::option::Option<SceneInfo>,
+    /// 0 from a server that does not know this field: it ends a subscriber that makes the writer wait for 30 s at a time.
+    #[prost(uint32, tag = "8")]
+    pub stall_budget_ms: u32,
 }
 /// The last accepted step is always acknowledged. Earlier steps may have no acknowledgment of their own.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -2943,10 +2958,11 @@ pub struct StreamFramesRequest {
     /// As in RenderFrameRequest.
     #[prost(message, repeated, tag = "2")]
     pub pictures: ::prost::alloc::vec::Vec<Picture>,
-    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber blocks it, and
-    /// is disconnected with REASON_SLOW_READER when it has blocked the writer for 30 s. If the writer sends only latest
-    /// steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with the current one if the scene
-    /// has had a step.
+    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber makes it wait,
+    /// and ends with REASON_SLOW_READER when it has used up the writer's stall budget (OpenDrive.stall_budget_ms). The error
+    /// names the last complete step and the first missing one. A new stream continues with the next step of the writer. If
+    /// the writer sends only latest steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with
+    /// the current one if the scene has had a step.
     #[prost(enumeration = "Delivery", tag = "3")]
     pub delivery: i32,
     /// Number of steps after which the stream ends; 0: no limit. A step that is sent again because of a moved camera
@@ -4065,10 +4081,11 @@ pub struct StreamVerticesRequest {
     pub scene: ::prost::alloc::string::String,
     #[prost(message, optional, tag = "2")]
     pub selection: ::core::option::Option<VertexSelection>,
-    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber blocks it, and
-    /// is disconnected with REASON_SLOW_READER when it has blocked the writer for 30 s. If the writer sends only latest
-    /// steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with the current one if the scene
-    /// has had a step.
+    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber makes it wait,
+    /// and ends with REASON_SLOW_READER when it has used up the writer's stall budget (OpenDrive.stall_budget_ms). The error
+    /// names the last complete step and the first missing one. A new stream continues with the next step of the writer. If
+    /// the writer sends only latest steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with
+    /// the current one if the scene has had a step.
     #[prost(enumeration = "Delivery", tag = "3")]
     pub delivery: i32,
     /// Number of steps after which the stream ends; 0: no limit.
@@ -4693,10 +4710,11 @@ pub struct GetStateResponse {
 pub struct StreamStatesRequest {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber blocks it, and
-    /// is disconnected with REASON_SLOW_READER when it has blocked the writer for 30 s. If the writer sends only latest
-    /// steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with the current one if the scene
-    /// has had a step.
+    /// DELIVERY_LOSSLESS: every step from the next one on. If the writer is lossless too, a slow subscriber makes it wait,
+    /// and ends with REASON_SLOW_READER when it has used up the writer's stall budget (OpenDrive.stall_budget_ms). The error
+    /// names the last complete step and the first missing one. A new stream continues with the next step of the writer. If
+    /// the writer sends only latest steps, a slow subscriber skips steps. DELIVERY_LATEST: the newest step, beginning with
+    /// the current one if the scene has had a step.
     #[prost(enumeration = "Delivery", tag = "2")]
     pub delivery: i32,
     /// Maximum number of states per second, finite and above 0; 0: no limit. The states that are sent are the newest ones,
@@ -5896,6 +5914,9 @@ pub struct Limits {
     /// their files until their scenes are deleted. A client may have four uploads in progress.
     #[prost(uint64, tag = "16")]
     pub client_upload_bytes: u64,
+    /// The stall budget of a writer that asks for none, in milliseconds (OpenDrive.stall_budget_ms).
+    #[prost(uint32, tag = "17")]
+    pub stall_budget_ms: u32,
 }
 /// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
 /// on it, and ignores values that it does not know.

@@ -197,6 +197,7 @@ fn exit_code(error: &Error) -> u8 {
         | Error::LimitReached { .. }
         | Error::OutOfMemory { .. }
         | Error::SlowReader { .. }
+        | Error::SlowSubscriber { .. }
         | Error::Unavailable { .. }
         | Error::ShuttingDown => 5,
         Error::Deadline { .. } | Error::Fault { .. } | Error::RendererLost { .. } => 6,

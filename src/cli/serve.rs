@@ -155,6 +155,11 @@ pub(super) struct Args {
     /// Default window of a step stream: how many steps may be unacknowledged.
     #[arg(long, default_value_t = Config::default().window)]
     window: u32,
+    /// Stall budget of a scene, in milliseconds: how long lossless readers may make the writer wait. It is refilled by a
+    /// tenth of the elapsed time. Readers that exceed it are disconnected (REASON_SLOW_READER), the slowest one first. A
+    /// writer may ask for another budget (modalcast-sim --stall-budget).
+    #[arg(long, default_value_t = default_ms(Config::default().stall_budget))]
+    stall_budget_ms: u64,
     /// Largest upload of one scene, in bytes.
     #[arg(long, default_value_t = Config::default().upload_bytes)]
     upload_bytes: u64,
@@ -232,6 +237,7 @@ impl Args {
             window: self.window,
             // The default window must not exceed the largest window that a client may request.
             max_window: defaults.max_window.max(self.window),
+            stall_budget: Duration::from_millis(self.stall_budget_ms),
             upload_bytes: self.upload_bytes,
             client_upload_bytes: self.client_upload_bytes,
             stored_bytes: self.stored_bytes,

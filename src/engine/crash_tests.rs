@@ -19,7 +19,7 @@ const SERVER_TEST: &str = "engine::crash_tests::server_with_fault";
 
 async fn start_engine(state: &Path) -> Engine {
     let device_work_limit = Duration::from_secs(5);
-    let config = Config { state: state.to_owned(), stall_timeout: HANG_GUARD, device_work_limit, ..Config::default() };
+    let config = Config { state: state.to_owned(), stall_budget: HANG_GUARD, device_work_limit, ..Config::default() };
     let config = Arc::new(config.validated().expect("expected a valid configuration"));
     let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);
     let engine = Engine::start_with_device(config, Arc::new(StripsSource), open_device).await;

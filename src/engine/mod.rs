@@ -70,6 +70,7 @@ pub use scene::lease::{InitialState, LeaseRequest, LeaseToken};
 pub use scene::message::StepSelector;
 pub use scene::step_queue::{Overflow, StepReport};
 pub use scene::subscriber::Subscription;
+pub use scene::work_timer::WorkTimer;
 pub use scene_memory::MemoryUse;
 pub use source::{SceneSource, StoredUpload};
 pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, UploadedShape};
@@ -575,7 +576,7 @@ mod tests {
 
     /// Starts an engine whose deformer injects faults, and opens the scenes "faulty" and "control".
     async fn start_faulty_engine(state_folder: &std::path::Path) -> (Engine, Arc<SceneHandle>, Arc<SceneHandle>) {
-        let config = Config { state: state_folder.to_owned(), stall_timeout: HANG_GUARD, ..Config::default() }
+        let config = Config { state: state_folder.to_owned(), stall_budget: HANG_GUARD, ..Config::default() }
             .validated()
             .expect("expected a valid configuration");
         let open_device = || DeviceContext::with_deformer(FaultyDeformer::boxed);

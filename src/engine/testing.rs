@@ -1,6 +1,7 @@
 //! Test scenes and a faulty deformer for the unit tests of the engine.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::scene::delivery::Delivery;
 use super::scene::lease::LeaseRequest;
@@ -209,6 +210,7 @@ pub(crate) fn lossless_lease(window: u32) -> LeaseRequest {
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window,
+        stall_budget: Duration::from_secs(3600),
         token: None,
         takes_over: false,
         initial_state: None,

@@ -2,6 +2,29 @@
 //! operator must repair, and failures of the server itself. Each variant contains the values that are needed to act on
 //! the error.
 
+use std::fmt;
+
+/// A step, by the number of its writer and its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StepNumber {
+    pub run: u64,
+    pub number: u64,
+}
+
+impl fmt::Display for StepNumber {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "step {} of run {}", self.number, self.run)
+    }
+}
+
+fn describe_slow_subscriber(received: Option<StepNumber>, missing: StepNumber) -> String {
+    let received = received.map_or_else(|| "none".into(), |step| step.to_string());
+    format!(
+        "the client reads too slowly and has used up the stall budget of the scene. Last complete step: {received}; \
+         first missing step: {missing}"
+    )
+}
+
 /// The error type of the server.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
@@ -54,6 +77,14 @@ pub enum Error {
     /// The caller has not read its replies in time.
     #[error("{queue} is full ({limit}), because the client does not read it")]
     SlowReader { queue: &'static str, limit: usize },
+    /// The writer of a scene has waited for the caller, a lossless subscriber, for longer than its stall budget allows.
+    #[error("{}", describe_slow_subscriber(*received, *missing))]
+    SlowSubscriber {
+        /// The last step that the caller has received completely.
+        received: Option<StepNumber>,
+        /// The first step that the caller has not received completely.
+        missing: StepNumber,
+    },
     /// The caller's deadline expired before the result was available.
     #[error("{what}: expected within {ms} ms, got none")]
     Deadline { what: String, ms: u64 },

@@ -1,10 +1,13 @@
 //! Conversions between wire messages and engine types. `wire_` functions create messages, `parse_` functions read them.
 //! Numbers from the wire are untrusted until a constructor of `modalcast_model::scene` has validated them.
 
+use std::time::Duration;
+
 use bytes::Bytes;
 use modalcast_proto::v1;
 
 use super::status::to_rejection;
+use crate::config::{Config, MAX_STALL_BUDGET};
 use crate::engine::{
     self, ContentHash, Delivery, Engine, FailedScene, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec,
     Overflow, PictureSpec, SceneAccess, SceneHandle, SceneRight, StepId, StepSelector, StreamDelivery, UploadedShape,
@@ -180,7 +183,7 @@ pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
 pub(super) fn parse_lease_request(
     open: &v1::OpenDrive,
     principal: &Principal,
-    default_window: u32,
+    config: &Config,
 ) -> Result<LeaseRequest> {
     let overflow = match v1::Overflow::try_from(open.overflow) {
         Ok(v1::Overflow::Unspecified | v1::Overflow::Block) => Overflow::Block,
@@ -199,11 +202,21 @@ pub(super) fn parse_lease_request(
         principal: principal.name.clone(),
         delivery: parse_delivery("open.delivery", open.delivery)?,
         overflow,
-        window: if open.window == 0 { default_window } else { open.window },
+        window: if open.window == 0 { config.window } else { open.window },
+        stall_budget: parse_stall_budget(open.stall_budget_ms, config.stall_budget)?,
         token,
         takes_over: open.take_over,
         initial_state,
     })
+}
+
+/// The stall budget that a writer asks for; `default` if it names none.
+fn parse_stall_budget(ms: u32, default: Duration) -> Result<Duration> {
+    let stall_budget = if ms == 0 { default } else { Duration::from_millis(ms.into()) };
+    match stall_budget <= MAX_STALL_BUDGET {
+        true => Ok(stall_budget),
+        false => Err(invalid("open.stall_budget_ms", format!("at most {}", MAX_STALL_BUDGET.as_millis()), ms)),
+    }
 }
 
 pub(super) const fn wire_delivery(delivery: Delivery) -> v1::Delivery {
@@ -228,6 +241,7 @@ pub(super) fn wire_opened(writer: &WriterSession, request: &LeaseRequest, scene_
         delivery: wire_delivery(request.delivery).into(),
         overflow: overflow.into(),
         window: writer.window,
+        stall_budget_ms: request.stall_budget.as_millis() as u32,
         lease_token: writer.token.as_bytes().to_vec().into(),
         initial_state: initial_state.into(),
         scene: Some(wire_scene_info(scene_handle)),

@@ -18,6 +18,7 @@ use super::convert::{
     wire_picture, wire_stages, wire_step_id,
 };
 use super::picks;
+use super::sent_steps::SentSteps;
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond, run_while_permitted};
@@ -104,6 +105,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
+        let client = connection.client(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
@@ -112,7 +114,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Stream).map_err(to_status)?;
         let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe(output_spec(&pictures), delivery).await.map_err(to_status)?;
+        let subscription = scene_handle.subscribe_client(Some(client), output_spec(&pictures), delivery).await;
+        let subscription = subscription.map_err(to_status)?;
         let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
         let entry = FrameStreamEntry { scene: Arc::clone(&scene_handle.scene), cameras };
         let registration = self.engine.register_frame_stream(entry).map_err(to_status)?;
@@ -158,9 +161,10 @@ impl FrameStream {
     ) -> Result<(), Status> {
         let to_response = |part| v1::StreamFramesResponse { part: Some(part) };
         reply_sender.send(to_response(StreamPart::Settings(self.settings()))).await?;
+        let mut sent_steps = SentSteps::default();
         loop {
             let frame = tokio::select! {
-                frame = frames.next() => frame.map_err(to_status)?,
+                frame = frames.next() => frame.map_err(|error| sent_steps.end(error, None))?,
                 () = reply_sender.closed() => return Ok(()),
             };
             let Some(frame) = frame else { return Ok(()) };
@@ -173,8 +177,11 @@ impl FrameStream {
                 };
                 tokio::select! {
                     sent = send => sent?,
-                    error = frames.encode_until_disconnected() => return Err(to_status(error)),
+                    error = frames.encode_until_disconnected() => return Err(sent_steps.end(error, Some(frame.step))),
                 }
+            }
+            if frame.picture as usize + 1 == self.pictures.len() {
+                sent_steps.complete(frame.step);
             }
         }
     }

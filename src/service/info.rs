@@ -52,6 +52,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             scene_host_bytes: info.memory.scene_host,
             scene_device_bytes: if info.memory.has_device { info.memory.scene_device } else { 0 },
             render_target_bytes: info.memory.render_targets,
+            stall_budget_ms: to_ms(config.stall_budget),
         };
         Ok(Response::new(v1::GetServerInfoResponse {
             version: env!("CARGO_PKG_VERSION").into(),

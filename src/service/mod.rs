@@ -28,6 +28,7 @@ mod request_body;
 mod revocable_body;
 mod routes;
 mod scenes;
+mod sent_steps;
 mod shared_memory;
 mod states;
 mod status;

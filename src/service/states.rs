@@ -8,9 +8,11 @@ use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
 use super::caller::Caller;
+use super::connection::ConnectionInfo;
 use super::convert::{
     describe_step_selector, parse_step_selector, parse_stream_delivery, right_to_receive, wire_stages, wire_step_id,
 };
+use super::sent_steps::SentSteps;
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, chunks_with_head, respond, run_while_permitted};
 use crate::engine::{
@@ -67,12 +69,15 @@ impl v1::state_service_server::StateService for StateServiceImpl {
     ) -> Result<Response<Self::StreamStatesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
         let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let client =
+            ConnectionInfo::of(&request).and_then(|info| info.client(request.metadata())).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
         let scene_handle = self.0.find_opened(&request.scene, &principal, right).await.map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe(OutputSpec::State, delivery).await.map_err(to_status)?;
+        let subscription = scene_handle.subscribe_client(Some(client), OutputSpec::State, delivery).await;
+        let subscription = subscription.map_err(to_status)?;
         let settings = v1::StateStreamSettings {
             delivery: request.delivery,
             max_hz: request.max_hz,
@@ -104,16 +109,18 @@ impl StateStream {
     ) -> Result<(), Status> {
         let to_response = |part| v1::StreamStatesResponse { part: Some(part) };
         reply_sender.send(to_response(Part::Settings(self.settings))).await?;
-        let mut sent_count = 0;
-        let mut previous_state = None;
+        let work_timer = Arc::clone(subscription.work_timer());
+        let (mut sent_steps, mut sent_count, mut previous_state) = (SentSteps::default(), 0, None);
         while self.settings.steps == 0 || sent_count < self.settings.steps {
             let output = tokio::select! {
-                output = subscription.next() => output.map_err(to_status)?,
+                output = work_timer.measure(subscription.next()) => output.map_err(|error| sent_steps.end(error, None))?,
                 () = reply_sender.closed() => return Ok(()),
             };
+            let step = output.step;
             let send_state = async {
                 let mut reply = reply_sender.reserve_whole(max_state_bytes(&self.scene)).await?;
-                let mut packed = pack_state(output, &self.scene, previous_state).await.map_err(to_status)?;
+                let pack = pack_state(output, &self.scene, previous_state);
+                let mut packed = work_timer.measure(pack).await.map_err(to_status)?;
                 reply.shrink_to(packed.bytes.len() + HEAD_BYTES);
                 // A division by 0 has no remainder: no state has stages then.
                 if sent_count.checked_rem(u64::from(self.settings.stages_every)) != Some(0) {
@@ -126,9 +133,10 @@ impl StateStream {
             };
             let sent_state = tokio::select! {
                 sent = send_state => sent,
-                error = subscription.disconnected() => Err(to_status(error)),
+                error = subscription.disconnected() => Err(sent_steps.end(error, Some(step))),
             };
             previous_state = Some(sent_state?);
+            sent_steps.complete(step);
             sent_count += 1;
         }
         Ok(())

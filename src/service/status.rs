@@ -8,7 +8,7 @@ use modalcast_proto::v1::{Reason, Rejection};
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-use modalcast_model::error::{Error, fault};
+use modalcast_model::error::{Error, StepNumber, fault};
 use modalcast_model::escaping::escape_controls;
 
 /// Limit in characters on each text of a rejection. Clients control parts of the text, and statuses are sent in HTTP/2
@@ -109,7 +109,8 @@ impl ErrorReport {
             | Error::Busy { .. }
             | Error::LimitReached { .. }
             | Error::OutOfMemory { .. }
-            | Error::SlowReader { .. }) => Self::of_exhausted(exhausted),
+            | Error::SlowReader { .. }
+            | Error::SlowSubscriber { .. }) => Self::of_exhausted(exhausted),
             Error::Deadline { what, ms } => {
                 let expected = format!("{what} within {ms} ms");
                 Self::new(Code::DeadlineExceeded, Reason::DeadlineExpired, expected, "no reply in time")
@@ -167,8 +168,20 @@ impl ErrorReport {
                 Self::new(Code::ResourceExhausted, Reason::SlowReader, expected, "a full queue")
                     .with_metadata([("queue", queue.into()), ("limit", limit.to_string())])
             }
+            Error::SlowSubscriber { received, missing } => Self::of_slow_subscriber(received, missing),
             other => Self::new(Code::Internal, Reason::Internal, "an exhausted resource", other.to_string()),
         }
+    }
+
+    /// The report of an error that ends a lossless stream.
+    fn of_slow_subscriber(received: Option<StepNumber>, missing: StepNumber) -> Self {
+        let expected = "a client that reads about as fast as the writer sends steps";
+        let given = "a client for which the writer has waited too long";
+        let mut metadata = vec![("missing_run", missing.run.to_string()), ("missing_step", missing.number.to_string())];
+        if let Some(StepNumber { run, number }) = received {
+            metadata.extend([("received_run", run.to_string()), ("received_step", number.to_string())]);
+        }
+        Self { metadata, ..Self::new(Code::ResourceExhausted, Reason::SlowReader, expected, given) }
     }
 
     fn lease_lost(run: u64) -> Self {

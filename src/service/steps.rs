@@ -158,7 +158,7 @@ impl DriveSession {
         let principal = &self.caller.principal;
         let right = if open.take_over { SceneRight::Control } else { SceneRight::Use };
         let scene_handle = self.engine.find_opened(&open.scene, principal, right).await?;
-        let request = parse_lease_request(&open, principal, self.engine.config().window)?;
+        let request = parse_lease_request(&open, principal, self.engine.config())?;
         let writer = scene_handle.drive(&self.caller.peer, request.clone()).await?;
         let opened = wire_opened(&writer, &request, &scene_handle);
         self.right_ended = Box::pin(scene_handle.right_ended(principal, right));

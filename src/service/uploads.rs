@@ -151,7 +151,7 @@ async fn receive_parts<U: StreamedUpload>(
 ) -> Result<(), Status> {
     use prost::Message as _;
     let max_message_bytes = engine.config().message_bytes;
-    let mut budget = UploadTimeBudget::new(engine.config().stall_timeout);
+    let mut budget = UploadTimeBudget::new(engine.config().upload_stall_budget);
     while let Some(request) =
         budget.wait(parts.message()).await?.map_err(|status| transport_status(status, max_message_bytes))?
     {

@@ -10,10 +10,12 @@ use v1::get_vertices_response::Part as SinglePart;
 use v1::stream_vertices_response::Part as StreamPart;
 
 use super::caller::Caller;
+use super::connection::ConnectionInfo;
 use super::convert::{
     describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, right_to_receive,
     wire_delivery, wire_sections, wire_stages, wire_step_id,
 };
+use super::sent_steps::SentSteps;
 use super::shared_memory::{CallMemory, SharedMemory};
 use super::status::to_status;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond, run_while_permitted, split_into_chunks};
@@ -74,6 +76,8 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let Caller { principal, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
+        let client =
+            ConnectionInfo::of(&request).and_then(|info| info.client(request.metadata())).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
@@ -81,7 +85,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe(spec, delivery).await.map_err(to_status)?;
+        let subscription = scene_handle.subscribe_client(Some(client), spec, delivery).await.map_err(to_status)?;
         let right_ended = scene_handle.right_ended(&principal, right);
         let vertex_stream = VertexStream {
             selection,
@@ -124,13 +128,15 @@ impl VertexStream {
         for layout in layout_parts(&self.selection) {
             reply_sender.send(to_response(StreamPart::Layout(layout))).await?;
         }
-        let (mut sent_steps, mut known_origins) = (0, None);
-        while self.max_steps == 0 || sent_steps < self.max_steps {
+        let work_timer = Arc::clone(subscription.work_timer());
+        let (mut sent_steps, mut sent_count, mut known_origins) = (SentSteps::default(), 0, None);
+        while self.max_steps == 0 || sent_count < self.max_steps {
             let output = tokio::select! {
-                output = subscription.next() => output.map_err(to_status)?,
+                output = work_timer.measure(subscription.next()) => output.map_err(|error| sent_steps.end(error, None))?,
                 () = reply_sender.closed() => return Ok(()),
             };
-            let vertices = self.packer.pack(output, &self.selection, known_origins).await.map_err(to_status)?;
+            let pack = self.packer.pack(output, &self.selection, known_origins);
+            let vertices = work_timer.measure(pack).await.map_err(to_status)?;
             for mut chunk in vertex_chunks(&vertices, self.max_chunk_bytes) {
                 let send = async {
                     chunk.shared = self.memory.share(&mut chunk.data).await;
@@ -138,11 +144,12 @@ impl VertexStream {
                 };
                 tokio::select! {
                     sent = send => sent?,
-                    error = subscription.disconnected() => return Err(to_status(error)),
+                    error = subscription.disconnected() => return Err(sent_steps.end(error, Some(vertices.step))),
                 }
             }
             known_origins = Some(vertices.origins);
-            sent_steps += 1;
+            sent_steps.complete(vertices.step);
+            sent_count += 1;
         }
         Ok(())
     }

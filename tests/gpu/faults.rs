@@ -114,6 +114,7 @@ async fn acquire_writer(scene: &SceneHandle) -> WriterSession {
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window: 1,
+        stall_budget: Config::default().stall_budget,
         token: None,
         takes_over: false,
         initial_state: None,

@@ -137,8 +137,8 @@ async fn rejections_on_step_streams_have_reasons() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn slow_reader_is_told_why_its_stream_ends() {
-    let stall_timeout = Duration::from_millis(50);
-    let server = Server::start_with(|config| Config { stall_timeout, ..config }).await;
+    let stall_budget = Duration::from_millis(50);
+    let server = Server::start_with(|config| Config { stall_budget, ..config }).await;
     server.open("sheet").await;
     let request = v1::StreamVerticesRequest {
         scene: "sheet".into(),

@@ -158,7 +158,7 @@ async fn server_stops_in_time_despite_unread_streams() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn silent_upload_times_out_and_leaves_no_files() {
-    let server = Server::start_with(|config| Config { stall_timeout: Duration::from_millis(60), ..config }).await;
+    let server = Server::start_with(|config| Config { upload_stall_budget: Duration::from_millis(60), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5 };
     let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
     let stalled_requests = tokio_stream::StreamExt::chain(tokio_stream::iter([part]), tokio_stream::pending());
@@ -171,7 +171,8 @@ async fn silent_upload_times_out_and_leaves_no_files() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn upload_below_minimum_rate_times_out() {
-    let server = Server::start_with(|config| Config { stall_timeout: Duration::from_millis(400), ..config }).await;
+    let server =
+        Server::start_with(|config| Config { upload_stall_budget: Duration::from_millis(400), ..config }).await;
     let header = v1::UploadHeader { scene: "up".into(), entry: String::new(), files: 1, total_bytes: 5000 };
     let file = v1::UploadFile { path: "scene.txt".into(), bytes: 5000, sha256: vec![0; 32].into(), reuse: false };
     let parts = [Part::Header(header), Part::File(file)].into_iter();

@@ -198,7 +198,8 @@ pub(crate) fn config(state: &Path) -> Config {
         reply_timeout: NEVER,
         deadline: NEVER,
         max_deadline: NEVER,
-        stall_timeout: NEVER,
+        stall_budget: NEVER,
+        upload_stall_budget: NEVER,
         handshake_timeout: NEVER,
         first_request_timeout: NEVER,
         keepalive_interval: NEVER,
@@ -208,7 +209,8 @@ pub(crate) fn config(state: &Path) -> Config {
 }
 
 /// Options of a server in a process of its own that raise the limits on the time that a client takes.
-pub(crate) const LONG_LIMITS: [&str; 4] = ["--deadline-ms", "600000", "--message-timeout-ms", "600000"];
+pub(crate) const LONG_LIMITS: [&str; 6] =
+    ["--deadline-ms", "600000", "--message-timeout-ms", "600000", "--stall-budget-ms", "600000"];
 
 /// A running server.
 pub(crate) struct Server {

@@ -164,8 +164,8 @@ async fn unread_lossless_subscription_applies_back_pressure() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn stalled_subscriber_is_disconnected_and_writer_continues() {
-    let stall_timeout = std::time::Duration::from_millis(50);
-    let server = Server::start_with(|config| modalcast::config::Config { stall_timeout, ..config }).await;
+    let stall_budget = std::time::Duration::from_millis(50);
+    let server = Server::start_with(|config| modalcast::config::Config { stall_budget, ..config }).await;
     server.open("strips").await;
     let mut subscription = subscribe_vertices(&server, Delivery::Lossless).await;
     let mut writer = server.drive("strips", v1::Delivery::Lossless, 1).await;
@@ -173,7 +173,7 @@ async fn stalled_subscriber_is_disconnected_and_writer_continues() {
         writer.send_step_and_wait(step(number, &[0], &[0.1, 0.0])).await;
     }
     let error = with_timeout(subscription.disconnected()).await;
-    assert!(matches!(error, modalcast_model::error::Error::SlowReader { .. }), "{error}");
+    assert!(matches!(error, modalcast_model::error::Error::SlowSubscriber { .. }), "{error}");
     with_timeout(subscription.next()).await.expect("expected the first queued step");
     with_timeout(subscription.next()).await.expect("expected the second queued step");
     assert_eq!(with_timeout(subscription.next()).await.expect_err("expected the subscription to end"), error);

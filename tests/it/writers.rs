@@ -389,10 +389,10 @@ async fn steps_do_not_wait_for_acknowledgments_of_a_distant_server() {
 /// the connection usable. A fifth stream is refused.
 #[tokio::test(flavor = "multi_thread")]
 async fn blocked_streams_of_tiny_steps_keep_the_connection_alive() {
-    let stall_timeout = Duration::from_secs(600);
+    let stall_budget = Duration::from_secs(600);
     // A small window, because all windows are filled with small frames. Whether this is safe depends only on the ratio
     // to the window of the connection.
-    let server = Server::start_with(|config| Config { stall_timeout, stream_window: 64 << 10, ..config }).await;
+    let server = Server::start_with(|config| Config { stall_budget, stream_window: 64 << 10, ..config }).await;
     let channel = server.channel().await;
     let mut blocked = Vec::new();
     for name in ["a", "b", "c", "d"] {

@@ -34,6 +34,7 @@ DRIVE_SCENE = "/modalcast.v1.StepService/DriveScene"
 RENDER_FRAME = "/modalcast.v1.FrameService/RenderFrame"
 GET_STATE = "/modalcast.v1.StateService/GetState"
 GET_VERTICES = "/modalcast.v1.VertexService/GetVertices"
+STREAM_VERTICES = "/modalcast.v1.VertexService/StreamVertices"
 HEALTH_WATCH = "/grpc.health.v1.Health/Watch"
 
 

@@ -34,6 +34,7 @@ ITEMS = {
     15: ("kept_inputs", "fuzzing"),
     16: (None, "soak: 16 clients that come and go"),
     17: ("credentials", "callers without a credential, and guessed tokens"),
+    18: ("stall_budget", "readers that do not read stop a writer only within its stall budget"),
 }
 
 # For items with checks, the part of the subject that is not claimed.

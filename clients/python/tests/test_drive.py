@@ -337,3 +337,11 @@ def test_transform_of_attached_domain_needs_joints_false(tree: mc.Scene):
     with tree.drive(joints=False) as drive:
         drive.step(transforms={attached: np.eye(4)})
         drive.reset()
+
+
+def test_stall_budget_is_above_zero_and_at_most_a_day(beams: mc.Scene):
+    with beams.drive(stall_budget=3600) as drive:
+        drive.step()
+    for seconds in (0, -1, 86_401, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="stall_budget: expected seconds above 0 and at most 86400"):
+            beams.drive(stall_budget=seconds)

@@ -56,7 +56,7 @@ pub use states::{
     StateStreamRequest,
 };
 pub use step::{DomainTransform, Step};
-pub use step_stream::{Ack, DriveRequest, StepStream, StreamSummary};
+pub use step_stream::{Ack, DriveRequest, MAX_STALL_BUDGET, StepStream, StreamSummary};
 pub use tonic::Code;
 pub use vertex_sections::VertexSetDomain;
 pub use vertices::{Attribute, Encoding, VertexRequest, VertexSelection, VertexSet, VertexStream, VertexStreamRequest};

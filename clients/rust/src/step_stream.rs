@@ -28,12 +28,21 @@ const MAX_STORED: usize = 1024;
 /// Maximum number of steps that wait inside this process for the connection.
 const QUEUED_STEPS: usize = 8;
 
+/// The largest stall budget of a writer: a day.
+pub const MAX_STALL_BUDGET: Duration = Duration::from_secs(86_400);
+
+/// Rounds up to whole milliseconds, because 0 means that no duration is set.
+fn wire_milliseconds(duration: Duration) -> u32 {
+    u32::try_from(duration.as_nanos().div_ceil(1_000_000)).unwrap_or(u32::MAX)
+}
+
 /// Describes a step stream before it is opened.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DriveRequest {
     scene: String,
     delivery: Delivery,
     window: Option<u32>,
+    stall_budget: Duration,
     lease_token: Vec<u8>,
     takes_over: bool,
     initial_state: v1::InitialState,
@@ -43,9 +52,15 @@ impl DriveRequest {
     /// A writer of the scene. The first step of the writer starts from the rest state. With [`Delivery::Lossless`],
     /// sending waits while the server has no capacity.
     pub fn new(scene: &str, delivery: Delivery) -> Self {
-        let (window, lease_token) = (None, Vec::new());
-        let initial_state = v1::InitialState::Unspecified;
-        Self { scene: scene.to_owned(), delivery, window, lease_token, takes_over: false, initial_state }
+        Self {
+            scene: scene.to_owned(),
+            delivery,
+            window: None,
+            stall_budget: Duration::ZERO,
+            lease_token: Vec::new(),
+            takes_over: false,
+            initial_state: v1::InitialState::Unspecified,
+        }
     }
 
     /// Limits the steps in flight (sent and not yet acknowledged): [`StepStream::step`] waits for acknowledgments.
@@ -54,6 +69,15 @@ impl DriveRequest {
     #[must_use]
     pub fn window(mut self, steps: u32) -> Self {
         self.window = Some(steps);
+        self
+    }
+
+    /// Sets how long lossless readers may make this writer wait, up to [`MAX_STALL_BUDGET`]: a budget that is refilled by
+    /// a tenth of the elapsed time. The server disconnects readers that exceed it. Zero selects the server's default,
+    /// which is 2 s. With [`MAX_STALL_BUDGET`], a slow reader slows this writer down instead of missing steps.
+    #[must_use]
+    pub const fn stall_budget(mut self, budget: Duration) -> Self {
+        self.stall_budget = budget;
         self
     }
 
@@ -93,6 +117,7 @@ impl DriveRequest {
             delivery: v1::Delivery::from(self.delivery).into(),
             overflow: overflow.into(),
             window: self.window.unwrap_or_default(),
+            stall_budget_ms: wire_milliseconds(self.stall_budget),
             lease_token: self.lease_token.clone().into(),
             take_over: self.takes_over,
             initial_state: self.initial_state.into(),
@@ -413,6 +438,14 @@ mod tests {
             expected: "4 bytes".into(),
             given: "3 bytes".into(),
         }
+    }
+
+    #[test]
+    fn stall_budget_is_sent_in_milliseconds_rounded_up() {
+        let sent = |budget| DriveRequest::new("toy", Delivery::Lossless).stall_budget(budget).to_wire().stall_budget_ms;
+        assert_eq!((sent(Duration::ZERO), sent(Duration::from_nanos(1))), (0, 1));
+        assert_eq!((sent(MAX_STALL_BUDGET), sent(Duration::MAX)), (86_400_000, u32::MAX));
+        assert_eq!(DriveRequest::new("toy", Delivery::Lossless).to_wire().stall_budget_ms, 0);
     }
 
     #[test]

@@ -18,7 +18,7 @@
 //! |---|---|---|
 //! | `Idle` | no step is in progress | the writer has queued a step |
 //! | `Deforming` | the device computes the step and finishes outputs of the previous one, messages wait | the device answers |
-//! | `Delivering` | the step is the current one, its writer waits for the acknowledgment | the outputs of every lossless subscriber are started, or the writer is not lossless or has disconnected |
+//! | `Delivering` | the step is the current one, its writer waits for the acknowledgment | the outputs of every lossless subscriber are started ([`StallBudget`](super::stall_budget) limits the wait), or the writer is not lossless or has disconnected |
 //!
 //! Single requests and subscribers are served in `Idle` and in `Delivering`. In every state the actor ends, and
 //! [`SceneActor::close`] consumes it, when
@@ -204,7 +204,7 @@ impl SceneActor {
     async fn serve(&mut self, mailbox: &mut mpsc::Receiver<Message>) -> ActorEnd {
         loop {
             self.advance().await;
-            let stall_deadline = self.delivery.next_stall_deadline();
+            let stall_check = self.delivery.next_stall_check();
             tokio::select! {
                 // Biased, so that a request sent before a step is registered when the step completes. Each iteration
                 // calls `advance`, so messages do not starve steps.
@@ -217,18 +217,18 @@ impl SceneActor {
                 },
                 () = self.wake.notified() => {}
                 () = self.delivery.finish_oldest_output(), if self.delivery.has_outputs_in_flight() => {}
-                () = sleep_until(stall_deadline) => {}
+                () = sleep_until(stall_check) => {}
             }
         }
     }
 
     /// Starts all outputs that can be started now and computes at most one step.
     async fn advance(&mut self) {
+        self.delivery.charge_stall(Instant::now());
         self.delivery.answer_requests(&self.current, self.run).await;
-        let applies_back_pressure = self.applies_back_pressure();
-        let mode = DeliveryMode { applies_back_pressure, overlaps_next_step: self.has_queued_step() };
+        let mode = DeliveryMode { overlaps_next_step: self.has_queued_step() };
         self.delivery.serve_subscribers(&self.current, mode).await;
-        if self.applies_back_pressure() && self.delivery.has_unserved_lossless(&self.current) {
+        if self.applies_back_pressure() && self.delivery.blocks_writer(&self.current, Instant::now()) {
             return;
         }
         self.acknowledge();
@@ -342,7 +342,8 @@ impl SceneActor {
     /// # Errors
     /// `LeaseTaken`; `Fault` when the run or the token cannot be created. The present writer then keeps the lease.
     async fn acquire_writer(&mut self, request: LeaseRequest) -> Result<AcquiredLease> {
-        let LeaseRequest { principal, delivery, overflow, window, token, takes_over, initial_state } = request;
+        let LeaseRequest { principal, delivery, overflow, window, stall_budget, token, takes_over, initial_state } =
+            request;
         let id = WriterId { principal, token: token.map_or_else(LeaseToken::random, Ok)? };
         let present_writer = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed());
         if let Some(writer) = present_writer
@@ -367,6 +368,7 @@ impl SceneActor {
         self.last_writer = Some(id.clone());
         let step_queue = Arc::new(StepQueue::new(delivery, overflow, window, Arc::clone(&self.wake)));
         let (acquired_at, lease) = (Instant::now(), WriterLease { step_queue: Arc::clone(&step_queue) });
+        self.delivery.reset_stall_budget(stall_budget, acquired_at);
         let token = id.token.clone();
         self.writer = Some(Writer { step_queue, id, acquired_at });
         Ok(AcquiredLease { lease, token, run, initial_state })

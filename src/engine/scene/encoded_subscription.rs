@@ -2,6 +2,7 @@
 //! delivered in order.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use super::delivery::Delivery;
 use super::subscriber::Subscription;
@@ -67,6 +68,11 @@ impl EncodedSubscription {
     /// The errors of drawing; `Fault` when a frame cannot be encoded; the error that ended the subscription, after the
     /// frames that are held.
     pub async fn next(&mut self) -> Result<Option<EncodedFrame>> {
+        let work_timer = Arc::clone(self.subscription.work_timer());
+        work_timer.measure(self.next_encoded()).await
+    }
+
+    async fn next_encoded(&mut self) -> Result<Option<EncodedFrame>> {
         self.sending = 0;
         loop {
             if let Some(frame) = self.encoded.pop_front() {
@@ -133,7 +139,6 @@ impl EncodedSubscription {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
     use std::time::Duration;
 
     use tokio::time::timeout;

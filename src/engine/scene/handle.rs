@@ -1,7 +1,7 @@
 //! Handle to one open scene: the immutable description of the scene, and a sender to the bounded mailbox of its task.
 
 use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
@@ -22,6 +22,7 @@ use crate::engine::scene_memory::SceneMemory;
 use crate::engine::storage::checkpoint_store::SceneCheckpoints;
 use crate::engine::storage::provenance::SceneProvenance;
 use crate::engine::storage::scene_record::{SceneAccess, SceneRight, SharedAccess};
+use crate::engine::upload_quota::ClientId;
 use crate::identity::Principal;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
@@ -216,6 +217,8 @@ impl SceneHandle {
             delivery: Delivery::Latest,
             overflow: Overflow::Block,
             window: 1,
+            // Not used by a writer that does not wait.
+            stall_budget: Duration::ZERO,
             token: None,
             takes_over,
             initial_state: Some(InitialState::Reset),
@@ -228,14 +231,29 @@ impl SceneHandle {
         }
     }
 
-    /// Subscribes to the scene's steps. The subscription is active when this returns.
+    /// Subscribes this process to the scene's steps, as [`Self::subscribe_client`] does for a client.
+    ///
+    /// # Errors
+    /// Those of [`Self::subscribe_client`].
+    pub async fn subscribe(&self, spec: OutputSpec, delivery: impl Into<StreamDelivery>) -> Result<Subscription> {
+        self.subscribe_client(None, spec, delivery.into()).await
+    }
+
+    /// Subscribes a client to the scene's steps. The subscription is active when this returns. The subscriptions of one
+    /// client share what they may use of the stall budget.
     ///
     /// # Errors
     /// `Unavailable` when frames are requested and there is no renderer; `LimitReached` when there are too many
     /// subscribers; `Busy` when the mailbox is full; `NotFound` when the scene is closed.
-    pub async fn subscribe(&self, spec: OutputSpec, delivery: impl Into<StreamDelivery>) -> Result<Subscription> {
+    pub async fn subscribe_client(
+        &self,
+        client: Option<ClientId>,
+        spec: OutputSpec,
+        delivery: StreamDelivery,
+    ) -> Result<Subscription> {
         self.check_spec(&spec)?;
-        let (subscriber, subscription) = Subscription::new(spec, delivery.into(), Arc::clone(&self.wake));
+        let (mut subscriber, subscription) = Subscription::new(spec, delivery, Arc::clone(&self.wake));
+        subscriber.client = client;
         self.call(|reply| Message::Subscribe { subscriber, reply }).await?;
         Ok(subscription)
     }

@@ -3,6 +3,7 @@
 
 use std::fmt;
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::delivery::Delivery;
 use super::step_queue::{Overflow, StepQueue};
@@ -69,6 +70,8 @@ pub struct LeaseRequest {
     pub overflow: Overflow,
     /// Number of steps that may be unacknowledged.
     pub window: u32,
+    /// How long lossless subscribers may make the writer wait; see [`StallBudget`](super::stall_budget::StallBudget).
+    pub stall_budget: Duration,
     /// `None` asks for a new token.
     pub token: Option<LeaseToken>,
     /// Whether the writer replaces a connected writer that has another token.

@@ -14,5 +14,7 @@ pub(super) mod message;
 mod output_delivery;
 mod output_producer;
 mod outputs_in_flight;
+mod stall_budget;
 pub(super) mod step_queue;
 pub(super) mod subscriber;
+pub(super) mod work_timer;

@@ -2,19 +2,24 @@
 //! received the current step yet. A subscriber receives one result per credit ([`super::subscriber`]).
 
 use std::mem;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use super::current_step::CurrentStep;
 use super::delivery::Delivery;
 use super::message::StepRequest;
 use super::output_producer::{DeliveryMode, OutputProducer, SceneOnDevice, SharedNeeds, attributes_for};
+use super::stall_budget::StallBudget;
 use super::step_queue::CompletedStep;
 use super::subscriber::Subscriber;
 use crate::config::Config;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::output_spec::PictureContent;
 use modalcast_model::deform::VertexAttributes;
-use modalcast_model::error::{Error, Result};
+use modalcast_model::error::{Error, Result, StepNumber};
+
+/// Shortest time between two checks of the stall budget while the writer waits. A check is only necessary because a
+/// subscriber may wait for its client at the end of the server's work, of which the scene is not notified.
+const MIN_STALL_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 
 /// Owns the subscribers and the single requests of one scene, and starts their outputs.
 pub(super) struct OutputDelivery {
@@ -22,6 +27,9 @@ pub(super) struct OutputDelivery {
     requests: Vec<StepRequest>,
     max_subscribers: usize,
     max_pending_requests: usize,
+    stall_budget: StallBudget,
+    /// When a subscriber may exceed the stall budget. `None` while the writer does not wait.
+    next_stall_check: Option<Instant>,
     producer: OutputProducer,
 }
 
@@ -32,7 +40,9 @@ impl OutputDelivery {
             requests: Vec::new(),
             max_subscribers: config.max_subscribers,
             max_pending_requests: config.max_pending_requests,
-            producer: OutputProducer::new(scene_on_device, device, config.stall_timeout),
+            stall_budget: StallBudget::new(config.stall_budget, Instant::now()),
+            next_stall_check: None,
+            producer: OutputProducer::new(scene_on_device, device),
         }
     }
 
@@ -50,6 +60,9 @@ impl OutputDelivery {
         // Counts as if the subscriber had received the step before its first one.
         subscriber.delivered_step_count =
             if receives_current { current.step_count.saturating_sub(1) } else { current.step_count };
+        let same_client = self.subscribers.iter().find(|other| other.client == subscriber.client);
+        subscriber.stall_time =
+            same_client.map_or_else(|| self.stall_budget.new_client(Instant::now()), |other| other.stall_time);
         self.subscribers.push(subscriber);
         Ok(())
     }
@@ -66,18 +79,58 @@ impl OutputDelivery {
         }
     }
 
-    /// Whether a lossless subscriber has not received the current step.
-    pub(super) fn has_unserved_lossless(&self, current: &CurrentStep) -> bool {
-        let lacks_current_step = |subscriber: &Subscriber| {
-            subscriber.delivery == Delivery::Lossless && subscriber.delivered_step_count < current.step_count
-        };
-        self.subscribers.iter().any(lacks_current_step)
+    /// Begins a full stall budget for a new writer.
+    pub(super) fn reset_stall_budget(&mut self, capacity: Duration, now: Instant) {
+        self.stall_budget = StallBudget::new(capacity, now);
+        let stall_time = self.stall_budget.new_client(now);
+        self.subscribers.iter_mut().for_each(|subscriber| subscriber.stall_time = stall_time);
     }
 
-    /// Deadline at which the subscriber that has blocked the writer for the longest time is disconnected.
-    pub(super) fn next_stall_deadline(&self) -> Option<Instant> {
-        let earliest_stall = self.subscribers.iter().filter_map(|subscriber| subscriber.stalled_since).min()?;
-        Some(earliest_stall + self.producer.stall_timeout)
+    /// When [`Self::charge_stall`] and [`Self::blocks_writer`] must be called again. `None` while the writer does not
+    /// wait.
+    pub(super) const fn next_stall_check(&self) -> Option<Instant> {
+        self.next_stall_check
+    }
+
+    /// Takes the wait of the writer since the last call of [`Self::blocks_writer`] from the stall budget.
+    pub(super) fn charge_stall(&mut self, now: Instant) {
+        if self.next_stall_check.take().is_none() {
+            return;
+        }
+        let end_stall = |subscriber: &mut Subscriber| Some((subscriber.client.clone(), subscriber.end_stall(now)?));
+        let stalls: Vec<_> = self.subscribers.iter_mut().filter_map(end_stall).collect();
+        let longest_stall = stalls.iter().map(|(_, stall)| *stall).max();
+        self.stall_budget.spend(longest_stall.unwrap_or_default(), now);
+        // All subscriptions of a client share its stall time.
+        for subscriber in &mut self.subscribers {
+            let of_client = stalls.iter().filter(|(client, _)| *client == subscriber.client);
+            let longest_stall = of_client.map(|(_, stall)| *stall).max();
+            subscriber.stall_time.add(longest_stall.unwrap_or_default(), now);
+        }
+    }
+
+    /// Whether the writer must wait until lossless subscribers have received the current step. Disconnects those of
+    /// them that have exceeded the stall budget.
+    pub(super) fn blocks_writer(&mut self, current: &CurrentStep, now: Instant) -> bool {
+        let budget = self.stall_budget;
+        let exceeds_budget = |subscriber: &Subscriber| {
+            subscriber.lacks_step(current.step_count)
+                && subscriber.waits_for_client()
+                && budget.remaining(&subscriber.stall_time, now).is_zero()
+        };
+        for slow_subscriber in self.subscribers.extract_if(.., |subscriber| exceeds_budget(subscriber)) {
+            let scene = self.producer.scene_name();
+            tracing::warn!(scene, "a lossless subscriber has exceeded the stall budget and is disconnected");
+            let missing = StepNumber { run: current.state.run, number: current.state.step };
+            slow_subscriber.disconnect(Error::SlowSubscriber { received: None, missing });
+        }
+        let blocking = self.subscribers.iter_mut().filter(|subscriber| subscriber.lacks_step(current.step_count));
+        let remaining = blocking.map(|subscriber| {
+            subscriber.begin_stall(now);
+            budget.remaining(&subscriber.stall_time, now)
+        });
+        self.next_stall_check = remaining.min().map(|remaining| now + remaining.max(MIN_STALL_CHECK_INTERVAL));
+        self.next_stall_check.is_some()
     }
 
     /// Answers every request whose step has been reached or passed. Drops requests whose caller no longer waits. `run`

@@ -3,14 +3,12 @@
 
 use std::cmp::Ordering;
 use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
 
 use super::current_step::CurrentStep;
-use super::delivery::Delivery;
 use super::frame_stream::CameraState;
 use super::message::StepSelector;
 use super::outputs_in_flight::OutputsInFlight;
-use super::subscriber::{LOSSLESS_CREDITS, Subscriber};
+use super::subscriber::Subscriber;
 use crate::engine::device::command::SceneId;
 use crate::engine::device::handle::{DeviceHandle, PendingReply};
 use crate::engine::output::output_spec::{OutputSpec, PictureContent, PictureSpec};
@@ -24,9 +22,6 @@ use modalcast_render::MAX_FRAMES_IN_FLIGHT;
 /// How the current step is delivered to subscribers.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct DeliveryMode {
-    /// A lossless subscriber without a credit, which permits one result, blocks the writer. It is disconnected after
-    /// `Config::stall_timeout`.
-    pub applies_back_pressure: bool,
     /// Whether another step is queued. Its frame will show a moved camera, too.
     pub overlaps_next_step: bool,
 }
@@ -83,7 +78,6 @@ struct StartedCopy {
 pub(super) struct OutputProducer {
     scene_on_device: SceneOnDevice,
     device: DeviceHandle,
-    pub(super) stall_timeout: Duration,
     pub(super) in_flight: OutputsInFlight,
     pictures: Vec<StartedPicture>,
     /// The newest copy. It is kept for later readers until the next step.
@@ -91,9 +85,13 @@ pub(super) struct OutputProducer {
 }
 
 impl OutputProducer {
-    pub(super) fn new(scene_on_device: SceneOnDevice, device: DeviceHandle, stall_timeout: Duration) -> Self {
+    pub(super) fn new(scene_on_device: SceneOnDevice, device: DeviceHandle) -> Self {
         let in_flight = OutputsInFlight::new(device.loss().clone());
-        Self { scene_on_device, device, stall_timeout, in_flight, pictures: Vec::new(), copy: None }
+        Self { scene_on_device, device, in_flight, pictures: Vec::new(), copy: None }
+    }
+
+    pub(super) fn scene_name(&self) -> &str {
+        &self.scene_on_device.name
     }
 
     /// Forgets the outputs of the previous step.
@@ -116,7 +114,7 @@ impl OutputProducer {
             return true;
         }
         if !subscriber.has_credit() {
-            return !is_new_step || self.check_stall(subscriber, mode);
+            return true;
         }
         let cameras = subscriber.take_pictures();
         let start = async {
@@ -138,23 +136,6 @@ impl OutputProducer {
     /// Starts an output of the current step for a single request.
     pub(super) async fn answer(&mut self, spec: &OutputSpec, current: &CurrentStep) -> StepOutput {
         output(current, self.start(spec, current, SharedNeeds::of_request()).await)
-    }
-
-    /// Disconnects a subscriber without a credit that has blocked the writer for too long. Returns false in that case.
-    fn check_stall(&self, subscriber: &mut Subscriber, mode: DeliveryMode) -> bool {
-        if !(mode.applies_back_pressure && subscriber.delivery == Delivery::Lossless) {
-            subscriber.stalled_since = None;
-            return true;
-        }
-        let stalled_since = *subscriber.stalled_since.get_or_insert_with(Instant::now);
-        let is_within_timeout = stalled_since.elapsed() < self.stall_timeout;
-        if !is_within_timeout {
-            let (scene, seconds) = (&self.scene_on_device.name, self.stall_timeout.as_secs());
-            tracing::warn!(scene, seconds, "a lossless subscriber did not read and is disconnected");
-            let error = Error::SlowReader { queue: "queue of results of this subscriber", limit: LOSSLESS_CREDITS };
-            subscriber.disconnect(error);
-        }
-        is_within_timeout
     }
 
     /// Starts an output of the current step, or shares one that was started. A copy of vertices also includes the

@@ -15,9 +15,12 @@ use tokio::sync::{Notify, mpsc, watch};
 
 use super::delivery::{Delivery, StreamDelivery};
 use super::frame_stream::{CameraControl, CameraState};
+use super::stall_budget::StallTime;
+use super::work_timer::WorkTimer;
 use crate::engine::lock::lock;
 use crate::engine::output::output_spec::{OutputSpec, PictureContent};
 use crate::engine::output::step_output::StepOutput;
+use crate::engine::upload_quota::ClientId;
 use modalcast_model::error::{Error, Result, fault};
 
 /// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
@@ -32,6 +35,14 @@ struct EndReason {
     is_immediate: bool,
 }
 
+/// The beginning of a wait of the writer for a subscriber.
+#[derive(Debug, Clone, Copy)]
+struct StallStart {
+    begun_at: Instant,
+    /// The time for which the server has worked for the subscription until then.
+    work: Duration,
+}
+
 /// The sender of a subscription, owned by the scene.
 #[derive(Debug)]
 pub(in crate::engine) struct Subscriber {
@@ -39,8 +50,13 @@ pub(in crate::engine) struct Subscriber {
     pub delivery: Delivery,
     /// The scene's step count at this subscriber's last result.
     pub delivered_step_count: u64,
-    /// When this subscriber began to block the writer.
-    pub stalled_since: Option<Instant>,
+    /// The client of the subscription; `None` for this process.
+    pub client: Option<ClientId>,
+    /// How long the writer has waited for this client.
+    pub(super) stall_time: StallTime,
+    /// Set while the writer waits for this subscriber.
+    stall_start: Option<StallStart>,
+    work_timer: Arc<WorkTimer>,
     /// The pictures with their present cameras; `None` for other outputs than frames.
     cameras: Option<watch::Receiver<CameraState>>,
     /// The version of the cameras in this subscriber's last result.
@@ -69,6 +85,29 @@ impl Subscriber {
         self.results.is_closed()
     }
 
+    /// Whether this is a lossless subscriber that has not received the scene's `step_count`-th step.
+    pub(in crate::engine) fn lacks_step(&self, step_count: u64) -> bool {
+        self.delivery == Delivery::Lossless && self.delivered_step_count < step_count
+    }
+
+    /// Whether the subscriber waits for its client, not for the server's own work.
+    pub(in crate::engine) fn waits_for_client(&self) -> bool {
+        !self.work_timer.is_running()
+    }
+
+    /// Marks the beginning of a wait of the writer for this subscriber.
+    pub(in crate::engine) fn begin_stall(&mut self, now: Instant) {
+        self.stall_start = Some(StallStart { begun_at: now, work: self.work_timer.total(now) });
+    }
+
+    /// Ends a wait of the writer for this subscriber. Returns its time without the server's own work, or `None` if the
+    /// writer did not wait.
+    pub(in crate::engine) fn end_stall(&mut self, now: Instant) -> Option<Duration> {
+        let StallStart { begun_at, work } = self.stall_start.take()?;
+        let work = self.work_timer.total(now).saturating_sub(work);
+        Some(now.saturating_duration_since(begun_at).saturating_sub(work))
+    }
+
     /// Waits until the subscription is dropped. Cancel-safe.
     pub(in crate::engine) async fn closed(&self) {
         self.results.closed().await;
@@ -94,7 +133,6 @@ impl Subscriber {
     pub(in crate::engine) fn mark_delivered(&mut self, step_count: u64) -> u64 {
         let skipped = (step_count - self.delivered_step_count).saturating_sub(1);
         self.delivered_step_count = step_count;
-        self.stalled_since = None;
         skipped
     }
 
@@ -125,6 +163,7 @@ pub struct Subscription {
     has_granted_credit: bool,
     rate_limiter: Option<RateLimiter>,
     content: Arc<Mutex<PictureContent>>,
+    work_timer: Arc<WorkTimer>,
     credits: Arc<AtomicUsize>,
     results: mpsc::Receiver<StepOutput>,
     end: watch::Receiver<Option<EndReason>>,
@@ -142,6 +181,7 @@ impl Subscription {
         let initial_credits = if delivery.delivery() == Delivery::Lossless { LOSSLESS_CREDITS } else { 0 };
         let credits = Arc::new(AtomicUsize::new(initial_credits));
         let content = Arc::new(Mutex::new(PictureContent::PIXELS));
+        let work_timer = Arc::new(WorkTimer::default());
         let (result_sender, results) = mpsc::channel(LOSSLESS_CREDITS);
         let (end_sender, end) = watch::channel(None);
         let cameras = match &spec {
@@ -152,7 +192,10 @@ impl Subscription {
             spec,
             delivery: delivery.delivery(),
             delivered_step_count: 0,
-            stalled_since: None,
+            client: None,
+            stall_time: StallTime::new(Duration::ZERO, Instant::now()),
+            stall_start: None,
+            work_timer: Arc::clone(&work_timer),
             cameras: cameras.as_ref().map(CameraControl::receiver),
             delivered_camera_version: 0,
             content: Arc::clone(&content),
@@ -163,8 +206,18 @@ impl Subscription {
         let rate_limiter =
             delivery.min_interval().map(|interval| RateLimiter { interval, next_credit: Instant::now() });
         let has_granted_credit = false;
-        let subscription =
-            Self { delivery, cameras, has_granted_credit, rate_limiter, content, credits, results, end, scene_wake };
+        let subscription = Self {
+            delivery,
+            cameras,
+            has_granted_credit,
+            rate_limiter,
+            content,
+            work_timer,
+            credits,
+            results,
+            end,
+            scene_wake,
+        };
         (subscriber, subscription)
     }
 
@@ -177,6 +230,11 @@ impl Subscription {
     /// Which steps the subscription receives, and the limit on their rate.
     pub const fn delivery(&self) -> StreamDelivery {
         self.delivery
+    }
+
+    /// Measures the server's own work on the results. All other time between two results counts as time of the client.
+    pub const fn work_timer(&self) -> &Arc<WorkTimer> {
+        &self.work_timer
     }
 
     /// Moves the cameras of a subscription to frames; `None` for other outputs.

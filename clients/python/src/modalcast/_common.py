@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -10,6 +11,9 @@ from modalcast.v1 import common_pb2
 
 Delivery: TypeAlias = Literal["latest", "lossless"]
 """Which steps a stream has: the newest ones ("latest"), or every step in order ("lossless")."""
+
+MAX_STALL_BUDGET = 86_400.0
+"""The largest stall budget of a drive, in seconds: a day."""
 
 _DELIVERIES: dict[str, common_pb2.Delivery] = {
     "latest": common_pb2.DELIVERY_LATEST,
@@ -46,6 +50,19 @@ def delivery_message(delivery: str) -> common_pb2.Delivery:
     if delivery not in _DELIVERIES:
         raise ValueError(f"delivery: expected 'latest' or 'lossless', got '{delivery}'")
     return _DELIVERIES[delivery]
+
+
+def stall_budget_milliseconds(seconds: float | None) -> int:
+    """The stall budget of a drive in the unit of the contract; 0 for the server's default.
+
+    Raises:
+        ValueError: The budget is not above 0, or is above a day.
+    """
+    if seconds is None:
+        return 0
+    if not 0 < seconds <= MAX_STALL_BUDGET:
+        raise ValueError(f"stall_budget: expected seconds above 0 and at most {MAX_STALL_BUDGET}, got {seconds}")
+    return math.ceil(1000 * seconds)
 
 
 def step_selector(step: StepId | int | None, *, exact: bool) -> common_pb2.StepSelector | None:

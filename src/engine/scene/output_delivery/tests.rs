@@ -16,12 +16,13 @@ use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{OutputBody, SharedPicture, StepOutput};
 use crate::engine::testing;
+use crate::engine::upload_quota::ClientId;
 use crate::hang_guard::HANG_GUARD;
 use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, RawStepUpdate, SceneState, StepUpdate};
 use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes, MAX_FRAMES_IN_FLIGHT};
 
-const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { applies_back_pressure: false, overlaps_next_step: false };
-const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true, ..WITHOUT_NEXT_STEP };
+const WITHOUT_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: false };
+const WITH_NEXT_STEP: DeliveryMode = DeliveryMode { overlaps_next_step: true };
 
 /// A frame that was requested from the device.
 struct DrawRequest {
@@ -346,4 +347,90 @@ async fn steps_are_acknowledged_in_order_after_their_outputs() {
         let report = step_queue.next_report().await.expect("expected a report");
         assert!(matches!(report, StepReport::Done { step, .. } if step == number), "{report:?}");
     }
+}
+
+/// The stall budget of a test. It exceeds the run time of the test, so that only the stalls that the test adds count.
+const STALL_BUDGET: Duration = Duration::from_secs(3600);
+
+/// A lossless subscription to states of a client, which has subscribed long ago.
+fn subscribe_client(client: u64) -> (Subscriber, Subscription) {
+    let (mut subscriber, subscription) =
+        Subscription::new(OutputSpec::State, Delivery::Lossless.into(), Arc::default());
+    subscriber.client = Some(ClientId::Connection(client));
+    (subscriber, subscription)
+}
+
+/// Delivers steps from `first` on until the writer must wait for a subscription, and returns the last one. `None` if the
+/// writer does not wait within four steps. `reader` reads every step.
+async fn deliver_until_blocked(
+    delivery: &mut OutputDelivery,
+    first: u64,
+    mut reader: Option<&mut Subscription>,
+) -> Option<CurrentStep> {
+    for number in first..first + 4 {
+        let step = current_step(number);
+        delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
+        if let Some(reader) = &mut reader {
+            reader.next().await.expect("expected a result");
+        }
+        if delivery.blocks_writer(&step, Instant::now()) {
+            return Some(step);
+        }
+    }
+    None
+}
+
+#[tokio::test]
+async fn only_subscribers_that_exceed_the_budget_end() {
+    let (unread_subscriber, mut unread) = subscribe_client(1);
+    let (reading_subscriber, mut reading) = subscribe_client(2);
+    let (mut delivery, _device) = delivery_to(vec![unread_subscriber, reading_subscriber]);
+    delivery.stall_budget = StallBudget::new(STALL_BUDGET, Instant::now());
+    let step = deliver_until_blocked(&mut delivery, 1, Some(&mut reading)).await.expect("expected a wait");
+    let later = Instant::now() + STALL_BUDGET / 4;
+    delivery.charge_stall(later);
+    assert!(delivery.blocks_writer(&step, later), "expected a writer that waits within the budget");
+    let end = Instant::now() + STALL_BUDGET;
+    delivery.charge_stall(end);
+    assert!(!delivery.blocks_writer(&step, end), "expected a writer that continues");
+    assert_eq!(delivery.next_stall_check(), None);
+    assert_eq!(delivery.subscribers.len(), 1);
+    let missing = StepNumber { run: 1, number: step.state.step };
+    assert_eq!(unread.disconnected().await, Error::SlowSubscriber { received: None, missing });
+    for number in 1..step.state.step {
+        assert_eq!(unread.next().await.expect("expected a buffered result").step.number, number);
+    }
+    unread.next().await.expect_err("expected the end");
+}
+
+/// The second subscription makes the writer wait after the first one has ended.
+#[tokio::test]
+async fn subscriptions_of_a_client_share_its_stall_time() {
+    for (second_client, remains) in [(1, false), (2, true)] {
+        let ((first, _first_unread), (second, mut reading)) = (subscribe_client(1), subscribe_client(second_client));
+        let (mut delivery, _device) = delivery_to(vec![first, second]);
+        delivery.stall_budget = StallBudget::new(STALL_BUDGET, Instant::now());
+        let step = deliver_until_blocked(&mut delivery, 1, Some(&mut reading)).await.expect("expected a wait");
+        let end = Instant::now() + STALL_BUDGET * 6 / 10;
+        delivery.charge_stall(end);
+        assert!(!delivery.blocks_writer(&step, end) && delivery.subscribers.len() == 1, "expected one subscription");
+        let blocked = deliver_until_blocked(&mut delivery, step.state.step + 1, None).await;
+        assert_eq!((blocked.is_some(), delivery.subscribers.len()), (remains, usize::from(remains)));
+    }
+}
+
+#[tokio::test]
+async fn work_of_the_server_is_not_charged() {
+    let (subscriber, subscription) = subscribe_client(1);
+    let work_timer = Arc::clone(subscription.work_timer());
+    let (mut delivery, _device) = delivery_to(vec![subscriber]);
+    delivery.stall_budget = StallBudget::new(STALL_BUDGET, Instant::now());
+    let work = async {
+        let step = deliver_until_blocked(&mut delivery, 1, None).await.expect("expected a wait");
+        let later = Instant::now() + 100 * STALL_BUDGET;
+        delivery.charge_stall(later);
+        assert!(delivery.blocks_writer(&step, later), "expected a subscriber that remains");
+    };
+    work_timer.measure(work).await;
+    assert_eq!(delivery.subscribers.len(), 1);
 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
-from modalcast._common import Delivery, StepId, delivery_message
+from modalcast._common import Delivery, StepId, delivery_message, stall_budget_milliseconds
 from modalcast._step_message import StepMessage
 from modalcast.errors import ConnectionLost
 from modalcast.kinematics import Kinematics
@@ -25,6 +25,7 @@ class DriveOptions:
     reset: bool | None
     take_over: bool
     window: int | None
+    stall_budget: float | None
     lease_token: bytes
     dt: float
 
@@ -270,6 +271,7 @@ class Drive:
             delivery=delivery_message(options.delivery),
             overflow=overflow,
             window=options.window or 0,
+            stall_budget_ms=stall_budget_milliseconds(options.stall_budget),
             lease_token=self.lease_token,
             take_over=options.take_over,
             initial_state=initial_state,

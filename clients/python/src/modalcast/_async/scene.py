@@ -216,6 +216,7 @@ class Scene:
         reset: bool | None = None,
         take_over: bool = False,
         window: int | None = None,
+        stall_budget: float | None = None,
         lease_token: bytes = b"",
         dt: float = 1 / 60,
         timeout: float | None = None,
@@ -230,6 +231,10 @@ class Scene:
                 state, unless `lease_token` is that of the last writer.
             take_over: Whether to replace the current writer.
             window: Largest number of steps without acknowledgment; None: the server's limit.
+            stall_budget: Seconds for which lossless readers may make the drive wait, up to a day: a budget that is
+                refilled by a tenth of the elapsed time. Readers that exceed it end with `LimitReached`. None: the
+                server's default of 2 s. With a large budget, a slow reader slows the drive down instead of missing
+                steps.
             lease_token: Replaces the writer with this token (`Drive.lease_token`) at once and continues its state.
             dt: Seconds between steps that do not set their time.
             timeout: Default time limit of the calls of the drive, in seconds.
@@ -245,7 +250,7 @@ class Scene:
             self.name,
             self._layout,
             kinematics,
-            DriveOptions(delivery, reset, take_over, window, lease_token, dt),
+            DriveOptions(delivery, reset, take_over, window, stall_budget, lease_token, dt),
             lambda: self.state(timeout=time_limit),
             timeout=time_limit,
             reconnect=self._reconnect,

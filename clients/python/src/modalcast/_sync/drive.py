@@ -8,7 +8,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from modalcast._common import Delivery, StepId, delivery_message
+from modalcast._common import Delivery, StepId, delivery_message, stall_budget_milliseconds
 from modalcast._step_message import StepMessage
 from modalcast._sync.streams import with_reconnect
 from modalcast._sync.transport import StepStream, Transport
@@ -27,6 +27,7 @@ class DriveOptions:
     reset: bool | None
     take_over: bool
     window: int | None
+    stall_budget: float | None
     lease_token: bytes
     dt: float
 
@@ -272,6 +273,7 @@ class Drive:
             delivery=delivery_message(options.delivery),
             overflow=overflow,
             window=options.window or 0,
+            stall_budget_ms=stall_budget_milliseconds(options.stall_budget),
             lease_token=self.lease_token,
             take_over=options.take_over,
             initial_state=initial_state,

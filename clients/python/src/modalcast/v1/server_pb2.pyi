@@ -71,7 +71,7 @@ class GetServerInfoResponse(_message.Message):
     def __init__(self, version: _Optional[str] = ..., backend: _Optional[str] = ..., device: _Optional[str] = ..., renderer: _Optional[str] = ..., software: bool = ..., limits: _Optional[_Union[Limits, _Mapping]] = ..., protocol_version: _Optional[int] = ..., features: _Optional[_Iterable[_Union[Feature, str]]] = ..., viewer_url_path: _Optional[str] = ...) -> None: ...
 
 class Limits(_message.Message):
-    __slots__ = ("message_bytes", "frame_side", "scenes", "window", "upload_bytes", "deadline_ms", "drives", "connection_receive_bytes", "message_timeout_ms", "connection_reply_bytes", "reply_timeout_ms", "scene_host_bytes", "scene_device_bytes", "render_target_bytes", "client_scenes", "client_upload_bytes")
+    __slots__ = ("message_bytes", "frame_side", "scenes", "window", "upload_bytes", "deadline_ms", "drives", "connection_receive_bytes", "message_timeout_ms", "connection_reply_bytes", "reply_timeout_ms", "scene_host_bytes", "scene_device_bytes", "render_target_bytes", "client_scenes", "client_upload_bytes", "stall_budget_ms")
     MESSAGE_BYTES_FIELD_NUMBER: _ClassVar[int]
     FRAME_SIDE_FIELD_NUMBER: _ClassVar[int]
     SCENES_FIELD_NUMBER: _ClassVar[int]
@@ -88,6 +88,7 @@ class Limits(_message.Message):
     RENDER_TARGET_BYTES_FIELD_NUMBER: _ClassVar[int]
     CLIENT_SCENES_FIELD_NUMBER: _ClassVar[int]
     CLIENT_UPLOAD_BYTES_FIELD_NUMBER: _ClassVar[int]
+    STALL_BUDGET_MS_FIELD_NUMBER: _ClassVar[int]
     message_bytes: int
     frame_side: int
     scenes: int
@@ -104,4 +105,5 @@ class Limits(_message.Message):
     render_target_bytes: int
     client_scenes: int
     client_upload_bytes: int
-    def __init__(self, message_bytes: _Optional[int] = ..., frame_side: _Optional[int] = ..., scenes: _Optional[int] = ..., window: _Optional[int] = ..., upload_bytes: _Optional[int] = ..., deadline_ms: _Optional[int] = ..., drives: _Optional[int] = ..., connection_receive_bytes: _Optional[int] = ..., message_timeout_ms: _Optional[int] = ..., connection_reply_bytes: _Optional[int] = ..., reply_timeout_ms: _Optional[int] = ..., scene_host_bytes: _Optional[int] = ..., scene_device_bytes: _Optional[int] = ..., render_target_bytes: _Optional[int] = ..., client_scenes: _Optional[int] = ..., client_upload_bytes: _Optional[int] = ...) -> None: ...
+    stall_budget_ms: int
+    def __init__(self, message_bytes: _Optional[int] = ..., frame_side: _Optional[int] = ..., scenes: _Optional[int] = ..., window: _Optional[int] = ..., upload_bytes: _Optional[int] = ..., deadline_ms: _Optional[int] = ..., drives: _Optional[int] = ..., connection_receive_bytes: _Optional[int] = ..., message_timeout_ms: _Optional[int] = ..., connection_reply_bytes: _Optional[int] = ..., reply_timeout_ms: _Optional[int] = ..., scene_host_bytes: _Optional[int] = ..., scene_device_bytes: _Optional[int] = ..., render_target_bytes: _Optional[int] = ..., client_scenes: _Optional[int] = ..., client_upload_bytes: _Optional[int] = ..., stall_budget_ms: _Optional[int] = ...) -> None: ...

@@ -27,19 +27,19 @@ from modalcast.v1 import errors_pb2 as modalcast_dot_v1_dot_errors__pb2
 from modalcast.v1 import scenes_pb2 as modalcast_dot_v1_dot_scenes__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18modalcast/v1/steps.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\x1a\x19modalcast/v1/errors.proto\x1a\x19modalcast/v1/scenes.proto\"5\n\x11ResetSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x11\n\ttake_over\x18\x02 \x01(\x08\"8\n\x12ResetSceneResponse\x12\"\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepId\"h\n\x11\x44riveSceneRequest\x12\'\n\x04open\x18\x01 \x01(\x0b\x32\x17.modalcast.v1.OpenDriveH\x00\x12\"\n\x04step\x18\x02 \x01(\x0b\x32\x12.modalcast.v1.StepH\x00\x42\x06\n\x04kind\"\xd9\x01\n\tOpenDrive\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12(\n\x08overflow\x18\x03 \x01(\x0e\x32\x16.modalcast.v1.Overflow\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x13\n\x0blease_token\x18\x05 \x01(\x0c\x12\x11\n\ttake_over\x18\x06 \x01(\x08\x12\x31\n\rinitial_state\x18\x07 \x01(\x0e\x32\x1a.modalcast.v1.InitialState\"\xcc\x02\n\x04Step\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0c\n\x04time\x18\x02 \x01(\x01\x12\x11\n\tq_domains\x18\x03 \x03(\r\x12\t\n\x01q\x18\x04 \x01(\x0c\x12\x19\n\x11transform_domains\x18\x05 \x03(\r\x12\x12\n\ntransforms\x18\x06 \x01(\x0c\x12\x37\n\x10transform_format\x18\x07 \x01(\x0e\x32\x1d.modalcast.v1.TransformFormat\x12\x10\n\x08has_more\x18\x08 \x01(\x08\x12\x30\n\x08shared_q\x18\t \x01(\x0b\x32\x19.modalcast.v1.SharedRangeH\x00\x88\x01\x01\x12\x39\n\x11shared_transforms\x18\n \x01(\x0b\x32\x19.modalcast.v1.SharedRangeH\x01\x88\x01\x01\x42\x0b\n\t_shared_qB\x14\n\x12_shared_transforms\"\x9f\x01\n\x12\x44riveSceneResponse\x12&\n\x06opened\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.OpenedH\x00\x12+\n\x03\x61\x63k\x18\x02 \x01(\x0b\x32\x1c.modalcast.v1.AcknowledgmentH\x00\x12,\n\trejection\x18\x03 \x01(\x0b\x32\x17.modalcast.v1.RejectionH\x00\x42\x06\n\x04kind\"\xe9\x01\n\x06Opened\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12(\n\x08overflow\x18\x03 \x01(\x0e\x32\x16.modalcast.v1.Overflow\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x13\n\x0blease_token\x18\x05 \x01(\x0c\x12\x31\n\rinitial_state\x18\x06 \x01(\x0e\x32\x1a.modalcast.v1.InitialState\x12&\n\x05scene\x18\x07 \x01(\x0b\x32\x17.modalcast.v1.SceneInfo\"\x84\x01\n\x0e\x41\x63knowledgment\x12\x0c\n\x04step\x18\x01 \x01(\x04\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\'\n\x06stages\x18\x03 \x03(\x0b\x32\x17.modalcast.v1.StageTime\x12\x19\n\x0c\x64urable_step\x18\x04 \x01(\x04H\x00\x88\x01\x01\x42\x0f\n\r_durable_step*M\n\x08Overflow\x12\x18\n\x14OVERFLOW_UNSPECIFIED\x10\x00\x12\x12\n\x0eOVERFLOW_BLOCK\x10\x01\x12\x13\n\x0fOVERFLOW_REJECT\x10\x02*^\n\x0cInitialState\x12\x1d\n\x19INITIAL_STATE_UNSPECIFIED\x10\x00\x12\x16\n\x12INITIAL_STATE_KEEP\x10\x01\x12\x17\n\x13INITIAL_STATE_RESET\x10\x02*\xa8\x01\n\x0fTransformFormat\x12 \n\x1cTRANSFORM_FORMAT_UNSPECIFIED\x10\x00\x12\x1f\n\x1bTRANSFORM_FORMAT_AFFINE_F32\x10\x01\x12(\n$TRANSFORM_FORMAT_QUATERNION_XYZW_F32\x10\x02\x12(\n$TRANSFORM_FORMAT_QUATERNION_XYZW_F64\x10\x03\x32\xb3\x01\n\x0bStepService\x12S\n\nDriveScene\x12\x1f.modalcast.v1.DriveSceneRequest\x1a .modalcast.v1.DriveSceneResponse(\x01\x30\x01\x12O\n\nResetScene\x12\x1f.modalcast.v1.ResetSceneRequest\x1a .modalcast.v1.ResetSceneResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x18modalcast/v1/steps.proto\x12\x0cmodalcast.v1\x1a\x19modalcast/v1/common.proto\x1a\x19modalcast/v1/errors.proto\x1a\x19modalcast/v1/scenes.proto\"5\n\x11ResetSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x11\n\ttake_over\x18\x02 \x01(\x08\"8\n\x12ResetSceneResponse\x12\"\n\x04step\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.StepId\"h\n\x11\x44riveSceneRequest\x12\'\n\x04open\x18\x01 \x01(\x0b\x32\x17.modalcast.v1.OpenDriveH\x00\x12\"\n\x04step\x18\x02 \x01(\x0b\x32\x12.modalcast.v1.StepH\x00\x42\x06\n\x04kind\"\xf2\x01\n\tOpenDrive\x12\r\n\x05scene\x18\x01 \x01(\t\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12(\n\x08overflow\x18\x03 \x01(\x0e\x32\x16.modalcast.v1.Overflow\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x13\n\x0blease_token\x18\x05 \x01(\x0c\x12\x11\n\ttake_over\x18\x06 \x01(\x08\x12\x31\n\rinitial_state\x18\x07 \x01(\x0e\x32\x1a.modalcast.v1.InitialState\x12\x17\n\x0fstall_budget_ms\x18\x08 \x01(\r\"\xcc\x02\n\x04Step\x12\x0e\n\x06number\x18\x01 \x01(\x04\x12\x0c\n\x04time\x18\x02 \x01(\x01\x12\x11\n\tq_domains\x18\x03 \x03(\r\x12\t\n\x01q\x18\x04 \x01(\x0c\x12\x19\n\x11transform_domains\x18\x05 \x03(\r\x12\x12\n\ntransforms\x18\x06 \x01(\x0c\x12\x37\n\x10transform_format\x18\x07 \x01(\x0e\x32\x1d.modalcast.v1.TransformFormat\x12\x10\n\x08has_more\x18\x08 \x01(\x08\x12\x30\n\x08shared_q\x18\t \x01(\x0b\x32\x19.modalcast.v1.SharedRangeH\x00\x88\x01\x01\x12\x39\n\x11shared_transforms\x18\n \x01(\x0b\x32\x19.modalcast.v1.SharedRangeH\x01\x88\x01\x01\x42\x0b\n\t_shared_qB\x14\n\x12_shared_transforms\"\x9f\x01\n\x12\x44riveSceneResponse\x12&\n\x06opened\x18\x01 \x01(\x0b\x32\x14.modalcast.v1.OpenedH\x00\x12+\n\x03\x61\x63k\x18\x02 \x01(\x0b\x32\x1c.modalcast.v1.AcknowledgmentH\x00\x12,\n\trejection\x18\x03 \x01(\x0b\x32\x17.modalcast.v1.RejectionH\x00\x42\x06\n\x04kind\"\x82\x02\n\x06Opened\x12\x0b\n\x03run\x18\x01 \x01(\x04\x12(\n\x08\x64\x65livery\x18\x02 \x01(\x0e\x32\x16.modalcast.v1.Delivery\x12(\n\x08overflow\x18\x03 \x01(\x0e\x32\x16.modalcast.v1.Overflow\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x13\n\x0blease_token\x18\x05 \x01(\x0c\x12\x31\n\rinitial_state\x18\x06 \x01(\x0e\x32\x1a.modalcast.v1.InitialState\x12&\n\x05scene\x18\x07 \x01(\x0b\x32\x17.modalcast.v1.SceneInfo\x12\x17\n\x0fstall_budget_ms\x18\x08 \x01(\r\"\x84\x01\n\x0e\x41\x63knowledgment\x12\x0c\n\x04step\x18\x01 \x01(\x04\x12\x0f\n\x07skipped\x18\x02 \x01(\x04\x12\'\n\x06stages\x18\x03 \x03(\x0b\x32\x17.modalcast.v1.StageTime\x12\x19\n\x0c\x64urable_step\x18\x04 \x01(\x04H\x00\x88\x01\x01\x42\x0f\n\r_durable_step*M\n\x08Overflow\x12\x18\n\x14OVERFLOW_UNSPECIFIED\x10\x00\x12\x12\n\x0eOVERFLOW_BLOCK\x10\x01\x12\x13\n\x0fOVERFLOW_REJECT\x10\x02*^\n\x0cInitialState\x12\x1d\n\x19INITIAL_STATE_UNSPECIFIED\x10\x00\x12\x16\n\x12INITIAL_STATE_KEEP\x10\x01\x12\x17\n\x13INITIAL_STATE_RESET\x10\x02*\xa8\x01\n\x0fTransformFormat\x12 \n\x1cTRANSFORM_FORMAT_UNSPECIFIED\x10\x00\x12\x1f\n\x1bTRANSFORM_FORMAT_AFFINE_F32\x10\x01\x12(\n$TRANSFORM_FORMAT_QUATERNION_XYZW_F32\x10\x02\x12(\n$TRANSFORM_FORMAT_QUATERNION_XYZW_F64\x10\x03\x32\xb3\x01\n\x0bStepService\x12S\n\nDriveScene\x12\x1f.modalcast.v1.DriveSceneRequest\x1a .modalcast.v1.DriveSceneResponse(\x01\x30\x01\x12O\n\nResetScene\x12\x1f.modalcast.v1.ResetSceneRequest\x1a .modalcast.v1.ResetSceneResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'modalcast.v1.steps_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_OVERFLOW']._serialized_start=1430
-  _globals['_OVERFLOW']._serialized_end=1507
-  _globals['_INITIALSTATE']._serialized_start=1509
-  _globals['_INITIALSTATE']._serialized_end=1603
-  _globals['_TRANSFORMFORMAT']._serialized_start=1606
-  _globals['_TRANSFORMFORMAT']._serialized_end=1774
+  _globals['_OVERFLOW']._serialized_start=1480
+  _globals['_OVERFLOW']._serialized_end=1557
+  _globals['_INITIALSTATE']._serialized_start=1559
+  _globals['_INITIALSTATE']._serialized_end=1653
+  _globals['_TRANSFORMFORMAT']._serialized_start=1656
+  _globals['_TRANSFORMFORMAT']._serialized_end=1824
   _globals['_RESETSCENEREQUEST']._serialized_start=123
   _globals['_RESETSCENEREQUEST']._serialized_end=176
   _globals['_RESETSCENERESPONSE']._serialized_start=178
@@ -47,15 +47,15 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_DRIVESCENEREQUEST']._serialized_start=236
   _globals['_DRIVESCENEREQUEST']._serialized_end=340
   _globals['_OPENDRIVE']._serialized_start=343
-  _globals['_OPENDRIVE']._serialized_end=560
-  _globals['_STEP']._serialized_start=563
-  _globals['_STEP']._serialized_end=895
-  _globals['_DRIVESCENERESPONSE']._serialized_start=898
-  _globals['_DRIVESCENERESPONSE']._serialized_end=1057
-  _globals['_OPENED']._serialized_start=1060
-  _globals['_OPENED']._serialized_end=1293
-  _globals['_ACKNOWLEDGMENT']._serialized_start=1296
-  _globals['_ACKNOWLEDGMENT']._serialized_end=1428
-  _globals['_STEPSERVICE']._serialized_start=1777
-  _globals['_STEPSERVICE']._serialized_end=1956
+  _globals['_OPENDRIVE']._serialized_end=585
+  _globals['_STEP']._serialized_start=588
+  _globals['_STEP']._serialized_end=920
+  _globals['_DRIVESCENERESPONSE']._serialized_start=923
+  _globals['_DRIVESCENERESPONSE']._serialized_end=1082
+  _globals['_OPENED']._serialized_start=1085
+  _globals['_OPENED']._serialized_end=1343
+  _globals['_ACKNOWLEDGMENT']._serialized_start=1346
+  _globals['_ACKNOWLEDGMENT']._serialized_end=1478
+  _globals['_STEPSERVICE']._serialized_start=1827
+  _globals['_STEPSERVICE']._serialized_end=2006
 # @@protoc_insertion_point(module_scope)

@@ -62,7 +62,7 @@ class DriveSceneRequest(_message.Message):
     def __init__(self, open: _Optional[_Union[OpenDrive, _Mapping]] = ..., step: _Optional[_Union[Step, _Mapping]] = ...) -> None: ...
 
 class OpenDrive(_message.Message):
-    __slots__ = ("scene", "delivery", "overflow", "window", "lease_token", "take_over", "initial_state")
+    __slots__ = ("scene", "delivery", "overflow", "window", "lease_token", "take_over", "initial_state", "stall_budget_ms")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     OVERFLOW_FIELD_NUMBER: _ClassVar[int]
@@ -70,6 +70,7 @@ class OpenDrive(_message.Message):
     LEASE_TOKEN_FIELD_NUMBER: _ClassVar[int]
     TAKE_OVER_FIELD_NUMBER: _ClassVar[int]
     INITIAL_STATE_FIELD_NUMBER: _ClassVar[int]
+    STALL_BUDGET_MS_FIELD_NUMBER: _ClassVar[int]
     scene: str
     delivery: _common_pb2.Delivery
     overflow: Overflow
@@ -77,7 +78,8 @@ class OpenDrive(_message.Message):
     lease_token: bytes
     take_over: bool
     initial_state: InitialState
-    def __init__(self, scene: _Optional[str] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., take_over: bool = ..., initial_state: _Optional[_Union[InitialState, str]] = ...) -> None: ...
+    stall_budget_ms: int
+    def __init__(self, scene: _Optional[str] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., take_over: bool = ..., initial_state: _Optional[_Union[InitialState, str]] = ..., stall_budget_ms: _Optional[int] = ...) -> None: ...
 
 class Step(_message.Message):
     __slots__ = ("number", "time", "q_domains", "q", "transform_domains", "transforms", "transform_format", "has_more", "shared_q", "shared_transforms")
@@ -114,7 +116,7 @@ class DriveSceneResponse(_message.Message):
     def __init__(self, opened: _Optional[_Union[Opened, _Mapping]] = ..., ack: _Optional[_Union[Acknowledgment, _Mapping]] = ..., rejection: _Optional[_Union[_errors_pb2.Rejection, _Mapping]] = ...) -> None: ...
 
 class Opened(_message.Message):
-    __slots__ = ("run", "delivery", "overflow", "window", "lease_token", "initial_state", "scene")
+    __slots__ = ("run", "delivery", "overflow", "window", "lease_token", "initial_state", "scene", "stall_budget_ms")
     RUN_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     OVERFLOW_FIELD_NUMBER: _ClassVar[int]
@@ -122,6 +124,7 @@ class Opened(_message.Message):
     LEASE_TOKEN_FIELD_NUMBER: _ClassVar[int]
     INITIAL_STATE_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
+    STALL_BUDGET_MS_FIELD_NUMBER: _ClassVar[int]
     run: int
     delivery: _common_pb2.Delivery
     overflow: Overflow
@@ -129,7 +132,8 @@ class Opened(_message.Message):
     lease_token: bytes
     initial_state: InitialState
     scene: _scenes_pb2.SceneInfo
-    def __init__(self, run: _Optional[int] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., initial_state: _Optional[_Union[InitialState, str]] = ..., scene: _Optional[_Union[_scenes_pb2.SceneInfo, _Mapping]] = ...) -> None: ...
+    stall_budget_ms: int
+    def __init__(self, run: _Optional[int] = ..., delivery: _Optional[_Union[_common_pb2.Delivery, str]] = ..., overflow: _Optional[_Union[Overflow, str]] = ..., window: _Optional[int] = ..., lease_token: _Optional[bytes] = ..., initial_state: _Optional[_Union[InitialState, str]] = ..., scene: _Optional[_Union[_scenes_pb2.SceneInfo, _Mapping]] = ..., stall_budget_ms: _Optional[int] = ...) -> None: ...
 
 class Acknowledgment(_message.Message):
     __slots__ = ("step", "skipped", "stages", "durable_step")
