@@ -144,6 +144,7 @@ async fn run_until_rest(client: &Client, model: &mut Model) {
         dt: options.dt,
         slow: 1.0,
         delivery: Delivery::Lossless,
+        stall_budget: None,
         window: None,
         realtime: false,
         applies_viewer_forces: true,

@@ -1,9 +1,10 @@
 //! The command line of `modalcast-sim`.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use modalcast_client::Delivery;
+use modalcast_client::{Delivery, MAX_STALL_BUDGET};
 use modalcast_dynamics::bridge::LoadDirection;
 use modalcast_dynamics::deflection::{VertexForce, VertexName};
 use modalcast_dynamics::implicit::ImplicitMethod;
@@ -147,6 +148,12 @@ pub(crate) struct CommonOptions {
     /// this option the server slows the process down by flow control.
     #[arg(long, value_name = "STEPS")]
     pub(crate) window: Option<u32>,
+    /// Seconds for which lossless readers, such as `modalcast record`, may make the run wait; at most a day (86400). The
+    /// budget is refilled by a tenth of the elapsed time, and the server disconnects readers that exceed it. Default: that
+    /// of the server, 2 s. Choose a large budget if a recording must have every step of a run that is faster than its
+    /// reader.
+    #[arg(long, value_name = "SECONDS", value_parser = parse_stall_budget)]
+    pub(crate) stall_budget: Option<Duration>,
     /// Run in real time instead of as fast as possible.
     #[arg(long)]
     pub(crate) realtime: bool,
@@ -391,6 +398,13 @@ fn parse_slow(text: &str) -> Result<SlowMotion, String> {
 fn parse_positive(text: &str) -> Result<f64, String> {
     let number = parse_non_negative(text)?;
     if number > 0.0 { Ok(number) } else { Err("expected a positive number".into()) }
+}
+
+fn parse_stall_budget(text: &str) -> Result<Duration, String> {
+    let budget = text.parse().ok().and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    budget
+        .filter(|budget| !budget.is_zero() && *budget <= MAX_STALL_BUDGET)
+        .ok_or_else(|| format!("expected a number of seconds above 0 and at most {}", MAX_STALL_BUDGET.as_secs()))
 }
 
 /// Parses a displacement as a fraction of the scene's diagonal or height, from 0 to 0.5.

@@ -103,6 +103,7 @@ async fn run_scenario(client: &Client, scene: String, arguments: &Cli) -> Result
         slow: timing.slow,
         delivery: common.delivery.into(),
         window: common.window,
+        stall_budget: common.stall_budget,
         realtime: common.realtime,
         applies_viewer_forces: common.forces,
         record_folder: common.record.clone(),

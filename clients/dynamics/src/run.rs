@@ -104,6 +104,8 @@ pub struct RunOptions {
     pub delivery: Delivery,
     /// Maximum number of steps in flight. `None` and 0 select the server's default.
     pub window: Option<u32>,
+    /// How long lossless readers may make the run wait. `None` selects the server's default.
+    pub stall_budget: Option<Duration>,
     /// Whether to run in real time, or `slow` times slower.
     pub realtime: bool,
     /// Whether the forces of viewers act on the scene.
@@ -240,6 +242,7 @@ impl<'a> Driver<'a> {
         };
         let request = DriveRequest::new(scene, options.delivery);
         let request = options.window.into_iter().fold(request, DriveRequest::window);
+        let request = options.stall_budget.into_iter().fold(request, DriveRequest::stall_budget);
         let step_stream = client.drive(&request).await?;
         let open_recorder = |folder: &PathBuf| match options.resume_path {
             Some(_) => Recorder::resume(folder, scenario.model(), start.recorded_rows),

@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use modalcast_client::{
     ArrayUpload, Client, Delivery, DescriptionRequest, DriveRequest, Error as ClientError, Frame, FrameStream,
-    FrameStreamRequest, Picture, Reason, SceneDescription, SceneInfo, Shape, StepStream, UploadDomain, UploadShape,
+    FrameStreamRequest, MAX_STALL_BUDGET, Picture, Reason, SceneDescription, SceneInfo, Shape, StepStream,
+    UploadDomain, UploadShape,
 };
 use tokio::sync::mpsc;
 use tokio::time::Instant;
@@ -186,7 +187,9 @@ pub async fn replay(
         [] => None,
         pictures => Some(client.stream_frames(&FrameStreamRequest::new(name, pictures.to_vec())).await?),
     };
-    let mut step_stream = client.drive(&DriveRequest::new(name, Delivery::Lossless).reset()).await?;
+    // The replay reads the pictures itself, and must not miss any while it writes to a slow disk.
+    let drive_request = DriveRequest::new(name, Delivery::Lossless).reset().stall_budget(MAX_STALL_BUDGET);
+    let mut step_stream = client.drive(&drive_request).await?;
     let run = step_stream.run;
     let (sender, queue) = mpsc::channel(QUEUED_STEPS);
     let (sent_sender, sent_steps) = mpsc::channel(SENT_STEPS);

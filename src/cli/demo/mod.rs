@@ -138,6 +138,8 @@ fn run_processes(args: &Args, input: &DemoScene, temporary_folder: &std::path::P
     let record_folder = temporary_folder.join("record").to_string_lossy().into_owned();
     let mut flags =
         vec!["--steps", &frame_count, "--dt", &dt, "--delivery", "lossless", "--record", &record_folder, "--json"];
+    // Both clients must receive every step, also if they write to a slow disk.
+    flags.extend(["--stall-budget", "600"]);
     let force_flags = input.force_files.demo_flags();
     flags.extend(force_flags.iter().map(String::as_str));
     let physics_process =

@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use modalcast_client::{Client, Delivery, DriveRequest, SceneDescription, Step, StepStream};
+use modalcast_client::{Client, Delivery, DriveRequest, MAX_STALL_BUDGET, SceneDescription, Step, StepStream};
 
 use super::SCENE;
 use modalcast_model::error::{Result, fault_in, invalid};
@@ -113,7 +113,8 @@ fn read_rows(path: &Path) -> Result<Vec<Vec<f32>>> {
 
 /// Opens a lossless step stream. `window` limits the steps in flight.
 pub(super) async fn open_writer(client: &Client, window: Option<u32>) -> Result<StepStream> {
-    let request = DriveRequest::new(SCENE, Delivery::Lossless).take_over();
+    // A measurement needs every step, also at a slow reader.
+    let request = DriveRequest::new(SCENE, Delivery::Lossless).take_over().stall_budget(MAX_STALL_BUDGET);
     let request = window.into_iter().fold(request, DriveRequest::window);
     client.drive(&request).await.map_err(fault_in("report"))
 }
