@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use bytes::Bytes;
@@ -11,8 +12,9 @@ use modalcast_client::{
     Client, ContentHash, Delivery, DrawnBy, Error as ClientError, FrameRequest, FrameStreamRequest, PROTOCOL_VERSION,
     Picture, Replies, SceneInfo, v1,
 };
+use prost::Message as _;
 use sha2::{Digest as _, Sha256};
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use v1::describe_scene_response::Part as DescriptionPart;
 use v1::stream_states_response::Part as StatePart;
 
@@ -24,9 +26,13 @@ use crate::writer::{MetadataEntry, RecordingWriter, WriteSummary};
 /// Longest time after which the open chunk is written.
 const FLUSH_INTERVAL: Duration = Duration::from_secs(1);
 
-/// Maximum number of messages that wait to be written, of at most about 1 MiB each. When the queue is full, the server
-/// waits ([`Delivery::Lossless`]) or skips steps ([`Delivery::Latest`]).
-const QUEUED_MESSAGES: usize = 8;
+/// Limit in bytes on the messages that wait to be written, so that a disk that is busy for some seconds neither makes the
+/// writer of the scene wait nor ends the recording. When the queue is full, the server waits within the stall budget of
+/// the writer ([`Delivery::Lossless`]) or skips steps ([`Delivery::Latest`]).
+const QUEUED_BYTES: usize = 256 << 20;
+
+/// Bytes for which a queued message counts in addition to its own: at least what it takes in memory.
+const MESSAGE_OVERHEAD: usize = 512;
 
 /// Number of hashes in one request: the limit of the server.
 const HASHES_PER_REQUEST: usize = 4096;
@@ -98,7 +104,7 @@ pub async fn record(
 
     let subscriptions = Subscriptions::open(client, &scene.scene, request).await?;
     on_ready();
-    let (sender, queue) = mpsc::channel(QUEUED_MESSAGES);
+    let (sender, queue) = write_queue();
     let write_task = tokio::task::spawn_blocking(move || write_messages(writer, queue));
     let error = subscriptions.forward(request.duration, &sender, stop).await;
     drop(sender);
@@ -290,12 +296,52 @@ enum WriteCommand {
     Flush,
 }
 
+impl WriteCommand {
+    fn bytes(&self) -> usize {
+        let message_bytes = match self {
+            Self::State(chunk) => chunk.encoded_len(),
+            Self::Forces(forces) => forces.encoded_len(),
+            Self::Flush => 0,
+        };
+        (MESSAGE_OVERHEAD + message_bytes).min(QUEUED_BYTES)
+    }
+}
+
+/// A command in the queue. Its bytes count until it is written.
+struct QueuedCommand {
+    command: WriteCommand,
+    _bytes: OwnedSemaphorePermit,
+}
+
+/// The end of the queue that the task of the streams owns.
+struct WriteSender {
+    commands: mpsc::Sender<QueuedCommand>,
+    free_bytes: Arc<Semaphore>,
+}
+
+/// Creates the queue of messages to write. Its bytes bound it: the channel has capacity for all messages that they admit.
+fn write_queue() -> (WriteSender, mpsc::Receiver<QueuedCommand>) {
+    let (commands, queue) = mpsc::channel(QUEUED_BYTES / MESSAGE_OVERHEAD);
+    (WriteSender { commands, free_bytes: Arc::new(Semaphore::new(QUEUED_BYTES)) }, queue)
+}
+
+impl WriteSender {
+    /// Queues a command. Waits while the queue is full. Returns false if the task that writes has ended.
+    async fn send(&self, command: WriteCommand) -> bool {
+        let acquire = Arc::clone(&self.free_bytes).acquire_many_owned(command.bytes() as u32);
+        tokio::select! {
+            bytes = acquire => bytes.is_ok_and(|_bytes| self.commands.try_send(QueuedCommand { command, _bytes }).is_ok()),
+            () = self.commands.closed() => false,
+        }
+    }
+}
+
 /// Writes messages until the queue is closed, then finishes the file.
 fn write_messages(
     mut writer: RecordingWriter<BufWriter<File>>,
-    mut queue: mpsc::Receiver<WriteCommand>,
+    mut queue: mpsc::Receiver<QueuedCommand>,
 ) -> Result<(File, WriteSummary)> {
-    while let Some(command) = queue.blocking_recv() {
+    while let Some(QueuedCommand { command, _bytes }) = queue.blocking_recv() {
         match command {
             WriteCommand::State(chunk) => writer.state_chunk(chunk)?,
             WriteCommand::Forces(forces) => writer.forces(&forces)?,
@@ -331,7 +377,7 @@ impl Subscriptions {
     async fn forward(
         mut self,
         duration: Option<Duration>,
-        sender: &mpsc::Sender<WriteCommand>,
+        sender: &WriteSender,
         stop: impl Future<Output = ()>,
     ) -> Option<ClientError> {
         let mut flushes = tokio::time::interval(FLUSH_INTERVAL);
@@ -364,10 +410,32 @@ impl Subscriptions {
                 () = &mut limit => return None,
                 () = &mut stop => return None,
             };
-            if sender.send(command).await.is_err() {
+            if !sender.send(command).await {
                 // The task that writes has failed, and returns its error.
                 return None;
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn queue_is_bounded_in_bytes_and_ends_with_its_reader() {
+        let (sender, mut queue) = write_queue();
+        let send_quarter = || {
+            let data = vec![0; QUEUED_BYTES / 4].into();
+            sender.send(WriteCommand::State(v1::StateChunk { data, ..Default::default() }))
+        };
+        for _ in 0..3 {
+            assert!(send_quarter().await);
+        }
+        tokio::time::timeout(Duration::ZERO, send_quarter()).await.expect_err("expected a full queue");
+        drop(queue.recv().await);
+        assert!(send_quarter().await, "expected capacity for a further message");
+        drop(queue);
+        assert!(!sender.send(WriteCommand::Flush).await, "expected the end of the queue");
     }
 }

@@ -64,8 +64,9 @@ struct RecordOptions {
     /// Number of states after which the recording ends; 0 for no limit.
     #[arg(long, default_value_t = 0)]
     steps: u64,
-    /// Record the newest states and skip steps, instead of slowing down the physics process. The summary states the
-    /// number of skipped steps.
+    /// Record the newest states and skip steps, instead of slowing down the physics process, which ends the recording when
+    /// the stall budget of the physics process is used up (modalcast-sim --stall-budget). The summary states the number of
+    /// skipped steps.
     #[arg(long)]
     latest: bool,
     /// Record only the hashes of meshes, modes and textures. The recording can then be replayed only on servers that
