@@ -309,8 +309,7 @@ pub struct Config {
     pub upload_stall_budget: Duration,
     /// Time for streams to end when the server shuts down.
     pub drain_timeout: Duration,
-    /// Limit on open connections. Above it, connections without calls are closed: those that have sent no request,
-    /// and then those that were idle for the longest time.
+    /// Limit on open connections, which clients share; see `modalcast::admission`.
     pub connections: usize,
     /// Time within which a new connection must complete its TLS handshake, and then the same time again, within which it
     /// must send the preface of HTTP/2, which is 24 bytes, or the head of a request in HTTP/1.1.

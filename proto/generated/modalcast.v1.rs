@@ -197,6 +197,9 @@ pub enum Reason {
     Unauthenticated = 22,
     /// PERMISSION_DENIED: the role of the caller does not permit the call, or the scene belongs to another principal.
     PermissionDenied = 23,
+    /// RESOURCE_EXHAUSTED: the call or its connection is ended to make room for another client. Metadata "object", "held" (by
+    /// this client) and "limit".
+    Preempted = 24,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -229,6 +232,7 @@ impl Reason {
             Self::OutOfMemory => "REASON_OUT_OF_MEMORY",
             Self::Unauthenticated => "REASON_UNAUTHENTICATED",
             Self::PermissionDenied => "REASON_PERMISSION_DENIED",
+            Self::Preempted => "REASON_PREEMPTED",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -258,6 +262,7 @@ impl Reason {
             "REASON_OUT_OF_MEMORY" => Some(Self::OutOfMemory),
             "REASON_UNAUTHENTICATED" => Some(Self::Unauthenticated),
             "REASON_PERMISSION_DENIED" => Some(Self::PermissionDenied),
+            "REASON_PREEMPTED" => Some(Self::Preempted),
             _ => None,
         }
     }
@@ -2499,8 +2504,9 @@ pub mod step_service_client {
             self
         }
         /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
-        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open`. Invalid input is
-        /// answered with a Rejection on the stream, and the stream remains open.
+        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open` within 30 s. Then a
+        /// stream without the lease ends with DEADLINE_EXCEEDED. Other invalid input is answered with a Rejection on the stream,
+        /// and the stream remains open.
         ///
         /// The lease ends with the stream. A client that has no more steps closes its side of the stream. The server then
         /// completes the accepted steps, sends the remaining replies and ends the stream with OK. If the stream is cancelled
@@ -2581,8 +2587,9 @@ pub mod step_service_server {
             + std::marker::Send
             + 'static;
         /// The first message must be `open`, which acquires the writer lease of the scene. A scene has one writer at a time.
-        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open`. Invalid input is
-        /// answered with a Rejection on the stream, and the stream remains open.
+        /// The reply to `open` is `opened`, or a rejection, after which the client may send another `open` within 30 s. Then a
+        /// stream without the lease ends with DEADLINE_EXCEEDED. Other invalid input is answered with a Rejection on the stream,
+        /// and the stream remains open.
         ///
         /// The lease ends with the stream. A client that has no more steps closes its side of the stream. The server then
         /// completes the accepted steps, sends the remaining replies and ends the stream with OK. If the stream is cancelled

@@ -195,6 +195,7 @@ fn exit_code(error: &Error) -> u8 {
         | Error::WindowFull { .. }
         | Error::Busy { .. }
         | Error::LimitReached { .. }
+        | Error::Preempted { .. }
         | Error::OutOfMemory { .. }
         | Error::SlowReader { .. }
         | Error::SlowSubscriber { .. }

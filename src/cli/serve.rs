@@ -126,7 +126,8 @@ pub(super) struct Args {
     /// open frame streams. Default: 8192 x 8192, and at least the largest frame.
     #[arg(long)]
     connection_pixels: Option<u32>,
-    /// Limit on open connections. Above it, a connection without calls is closed for each new one.
+    /// Limit on open connections. Above it, each new one ends the one with the least progress of the principal and the client
+    /// that hold the most.
     #[arg(long, default_value_t = Config::default().connections)]
     connections: usize,
     /// Limit on the host memory of all scenes, in bytes. Default: half of the memory of the machine or its control group.

@@ -106,6 +106,7 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_quota::{UploadPermit, UploadQuota};
+use crate::admission::AdmissionMetrics;
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
@@ -127,6 +128,7 @@ struct Shared {
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
     load_permits: LoadPermits,
+    admission_metrics: AdmissionMetrics,
     upload_quota: Arc<UploadQuota>,
     /// Whether every scene of the last run is open or has failed.
     are_scenes_reopened: watch::Sender<bool>,
@@ -201,6 +203,7 @@ impl Engine {
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
             load_permits: LoadPermits::new(),
+            admission_metrics: AdmissionMetrics::default(),
             upload_quota,
             are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),
@@ -217,6 +220,11 @@ impl Engine {
     /// The backend and the renderer in use.
     pub fn info(&self) -> &EngineInfo {
         &self.shared.info
+    }
+
+    /// The counters of refused and preempted permits.
+    pub fn admission_metrics(&self) -> &AdmissionMetrics {
+        &self.shared.admission_metrics
     }
 
     /// The server's configuration.

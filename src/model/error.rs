@@ -71,6 +71,10 @@ pub enum Error {
     /// As many objects exist as the configuration allows.
     #[error("at most {limit} {objects} are allowed")]
     LimitReached { objects: &'static str, limit: usize },
+    /// The server has ended what the caller held in favor of another client. `held` is what the caller held of `limit`
+    /// objects.
+    #[error("ended to make room for another client: this client held {held} of at most {limit} {objects}")]
+    Preempted { objects: &'static str, held: usize, limit: usize },
     /// An object of a scene needs more memory than is left of a limit. `memory` names the limit. Nothing was allocated.
     #[error("{object}: expected at most {available} bytes ({memory}, in total {total}), got {asked}")]
     OutOfMemory { object: String, memory: &'static str, asked: u64, available: u64, total: u64 },

@@ -1,4 +1,4 @@
-//! Accepts connections under a limit, and encrypts those of TCP if the server has a certificate. Serves gRPC on those that
+//! Accepts connections that get a permit, and encrypts those of TCP if the server has a certificate. Serves gRPC on those that
 //! begin with the preface of HTTP/2, and the browser viewer on the others. A connection that does not complete its TLS
 //! handshake, or does not send its first bytes or its first request, in time is closed. The listener pauses after a failed
 //! accept, so that it does not spin when file descriptors run out.
@@ -21,11 +21,13 @@ use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
 use super::connection_gauges::ConnectionGauges;
 use super::connection_table::{ConnectionSlot, ConnectionTable, GOAWAY_TIMEOUT};
 use super::control_frames::ControlFrameLimit;
-use super::listen::{ListeningSockets, Peer, Socket};
+use super::listen::{ListeningSockets, Socket};
 use super::metered_socket::MeteredSocket;
+use super::peer::Peer;
 use super::routes::Routes;
 use super::tls::TlsServer;
 use super::web::WebServer;
+use crate::admission::Account;
 use crate::config::Config;
 
 /// Pause of the listener after a failed accept.
@@ -79,24 +81,31 @@ impl ConnectionServer {
     pub(super) async fn accept_connections(self: Arc<Self>, sockets: ListeningSockets, table: Arc<ConnectionTable>) {
         loop {
             match sockets.accept().await {
-                Ok((socket, peer)) => {
-                    let slot = table.insert().await;
-                    tokio::spawn(Arc::clone(&self).serve(socket, peer, slot));
-                }
+                Ok((socket, peer)) => match table.insert(&self.account_of(&peer)).await {
+                    Ok(slot) => drop(tokio::spawn(Arc::clone(&self).serve(socket, peer, slot))),
+                    Err(error) => tracing::debug!(peer = peer.name, %error, "a connection is refused"),
+                },
                 Err(error) => {
                     tracing::warn!(%error, "a connection could not be accepted");
                     // The process may have too few file descriptors, and closing a connection frees one.
-                    table.evict();
+                    table.preempt_one();
                     tokio::time::sleep(ACCEPT_RETRY_DELAY).await;
                 }
             }
         }
     }
 
+    /// The account of a connection by what is known before its first bytes.
+    fn account_of(&self, peer: &Peer) -> Account {
+        let credential = self.authenticator.credential_of_connection(peer.uid, &[]);
+        let principal = credential.map(|credential| Arc::clone(credential.principal()));
+        principal.map_or(Account::anonymous(peer.client()), |principal| Account::new(&principal, peer.client()))
+    }
+
     /// Serves a connection until it ends or must be closed.
     async fn serve(self: Arc<Self>, socket: Socket, peer: Peer, slot: ConnectionSlot) {
         tokio::select! {
-            () = slot.signals.close.notified() => {}
+            () = slot.overdue() => {}
             () = self.serve_until_retired(socket, peer, &slot) => {}
         }
     }
@@ -105,7 +114,7 @@ impl ConnectionServer {
         let Some(mut socket) = self.encrypt(socket, &peer).await else { return };
         let protocol = tokio::time::timeout(self.handshake_timeout, detect_protocol(&mut socket));
         let Ok(Ok(Some(protocol))) = protocol.await else { return };
-        let info_with = |credential| ConnectionInfo::new(&peer.name, credential, &self.budgets, slot);
+        let info_with = |credential| ConnectionInfo::new(&peer, credential, &self.budgets, slot);
         match (protocol, &self.web) {
             (Protocol::Http2, _) => {
                 let _counted = self.connections.count("grpc");
@@ -123,8 +132,8 @@ impl ConnectionServer {
     }
 
     /// Makes a TLS connection of a TCP connection if the server has a certificate. `None` if the handshake fails or takes too
-    /// long. The table bounds the number of handshakes: connections in one have sent no request, and are closed first when
-    /// the table is full.
+    /// long. The table bounds the number of handshakes: connections in one are anonymous and without progress, and are closed
+    /// first when the table is full.
     async fn encrypt(&self, socket: Socket, peer: &Peer) -> Option<Socket> {
         let (tls, stream) = match (&self.tls, socket) {
             (Some(tls), Socket::Tcp(stream)) => (tls, stream),
@@ -146,14 +155,14 @@ impl ConnectionServer {
         let mut connection = std::pin::pin!(self.http2.serve_connection(TokioIo::new(io), service));
         tokio::select! {
             result = &mut connection => return log_end(result),
-            () = slot.signals.retire.notified() => {}
+            () = slot.retired() => {}
             () = slot.first_request_overdue(self.first_request_timeout) => {}
         }
         connection.as_mut().graceful_shutdown();
         loop {
             match tokio::time::timeout(GOAWAY_TIMEOUT, &mut connection).await {
                 Ok(result) => return log_end(result),
-                Err(_) if slot.activity.is_idle() => return,
+                Err(_) if slot.calls.is_empty() => return,
                 Err(_) => {}
             }
         }

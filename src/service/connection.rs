@@ -1,17 +1,19 @@
 //! What the server knows about the connection of a call.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::metadata::MetadataMap;
 
-use super::connection_table::{Activity, ConnectionSlot};
+use super::connection_table::ConnectionSlot;
+use super::open_calls::OpenCalls;
+use super::peer::Peer;
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
+use crate::admission::{Account, Client, PermitHandle};
 use crate::config::Config;
 use crate::engine::{ClientId, LeaseToken};
-use crate::identity::Credential;
+use crate::identity::{Credential, Principal, TokenHash};
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams,
@@ -27,9 +29,6 @@ pub(super) const MAX_DRIVES: usize = 4;
 
 /// Metadata key of the lease token of a client that opens or uploads scenes.
 const LEASE_TOKEN_KEY: &str = "modalcast-lease-token-bin";
-
-/// Number of connections so far.
-static CONNECTION_COUNTER: AtomicU64 = AtomicU64::new(0);
 
 /// The budgets that all connections share.
 #[derive(Debug, Clone)]
@@ -52,8 +51,10 @@ impl Budgets {
 /// A connection, in the extensions of each of its calls.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionInfo {
-    /// Number of the connection, which no other connection of the server has.
+    /// Number of the connection; see [`Peer::number`].
     id: u64,
+    /// The client to which the permits of calls count.
+    client: Client,
     /// Never sent to another client.
     peer: Arc<str>,
     /// The credential of calls without a token.
@@ -66,7 +67,9 @@ pub(super) struct ConnectionInfo {
     max_pixels: u32,
     pub(super) receive: Arc<ConnectionReceiveBudget>,
     pub(super) reply: Arc<ConnectionReplyBudget>,
-    pub(super) activity: Arc<Activity>,
+    pub(super) calls: Arc<OpenCalls>,
+    /// The permit of the connection.
+    pub(super) permit: PermitHandle,
 }
 
 impl ConnectionInfo {
@@ -80,22 +83,24 @@ impl ConnectionInfo {
     }
 
     pub(super) fn new(
-        peer: &str,
+        peer: &Peer,
         credential: Option<Arc<Credential>>,
         budgets: &Budgets,
         slot: &ConnectionSlot,
     ) -> Self {
         Self {
-            id: CONNECTION_COUNTER.fetch_add(1, Ordering::Relaxed),
-            peer: peer.into(),
+            id: peer.number,
+            client: peer.client(),
+            peer: peer.name.as_str().into(),
             credential,
             drive_permits: Arc::new(Semaphore::new(MAX_DRIVES)),
             frame_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
             stream_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
             max_pixels: budgets.max_connection_pixels,
             receive: budgets.receive.new_connection(),
-            reply: budgets.reply.new_connection(Arc::clone(&slot.signals.close)),
-            activity: Arc::clone(&slot.activity),
+            reply: budgets.reply.new_connection(Arc::clone(&slot.close)),
+            calls: Arc::clone(&slot.calls),
+            permit: slot.permit().clone(),
         }
     }
 
@@ -108,6 +113,17 @@ impl ConnectionInfo {
         let Some(value) = metadata.get_bin(LEASE_TOKEN_KEY) else { return Ok(ClientId::Connection(self.id)) };
         let bytes = value.to_bytes().map_err(|_| invalid(LEASE_TOKEN_KEY, "a binary value", "another value"))?;
         LeaseToken::parse(LEASE_TOKEN_KEY, &bytes).map(|token| ClientId::of_token(token.as_bytes()))
+    }
+
+    /// Gives later calls the credential of a viewer's session. They count to this session.
+    pub(super) fn begin_session(&mut self, token: &str, credential: Arc<Credential>) {
+        self.credential = Some(credential);
+        self.client = TokenHash::of(token).map_or(self.client, Client::Session);
+    }
+
+    /// Counts the connection to the principal of a call, unless it counts to one already.
+    pub(super) fn identify(&self, principal: &Principal) {
+        self.permit.identify(|| Account::new(principal, self.client));
     }
 
     /// Name of the client, for the log: its address, or its process.

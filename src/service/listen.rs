@@ -13,6 +13,7 @@ use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 
 use super::authentication::Authenticator;
+use super::peer::Peer;
 use super::tls::{TlsServer, TlsSocket};
 use crate::config::{Config, ListenAddress, PublicUrl, SocketPermissions};
 use crate::identity::CertificateName;
@@ -47,15 +48,6 @@ pub(super) struct ListeningSockets(Vec<ListeningSocket>);
 enum ListeningSocket {
     Tcp(TcpListener),
     Unix(UnixListener),
-}
-
-/// The other end of a connection.
-#[derive(Debug)]
-pub(super) struct Peer {
-    /// For the log: its address, or its process.
-    pub(super) name: String,
-    /// The user of a Unix socket's client at the time of its connection.
-    pub(super) uid: Option<u32>,
 }
 
 /// The connection of a client.
@@ -308,14 +300,14 @@ impl ListeningSocket {
         match self {
             Self::Tcp(listener) => listener.poll_accept(cx)?.map(|(stream, peer)| {
                 stream.set_nodelay(true)?;
-                Ok((Socket::Tcp(stream), Peer { name: peer.to_string(), uid: None }))
+                Ok((Socket::Tcp(stream), Peer::new(peer.to_string(), None, None)))
             }),
             Self::Unix(listener) => listener.poll_accept(cx)?.map(|(stream, _)| {
                 let credentials = stream.peer_cred().ok();
                 let uid = credentials.map(|credentials| credentials.uid());
                 let pid = credentials.and_then(|credentials| credentials.pid());
                 let name = pid.map_or_else(|| "unix socket".to_owned(), |pid| format!("process {pid}"));
-                Ok((Socket::Unix(stream), Peer { name, uid }))
+                Ok((Socket::Unix(stream), Peer::new(name, uid, pid)))
             }),
         }
     }

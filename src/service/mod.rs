@@ -16,8 +16,11 @@ mod forces;
 mod frame_allowance;
 mod frames;
 mod info;
+mod interruptible_body;
 mod listen;
 mod metered_socket;
+mod open_calls;
+mod peer;
 mod permissions;
 mod picks;
 mod progress_timer;
@@ -25,7 +28,6 @@ mod receive_budget;
 mod reply_body;
 mod reply_budget;
 mod request_body;
-mod revocable_body;
 mod routes;
 mod scenes;
 mod sent_steps;
@@ -115,7 +117,7 @@ pub async fn serve(
     let connection_server =
         ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config);
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
-    let table = ConnectionTable::new(config.connections);
+    let table = ConnectionTable::new(config.connections, engine.admission_metrics());
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {

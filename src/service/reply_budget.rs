@@ -19,8 +19,8 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 use tonic::body::Body;
 
-use super::connection_table::CountedCall;
 use super::fair_bytes::{ByteGrant, ByteHolder, FairBytes};
+use super::open_calls::CountedCall;
 use super::status::internal_fault;
 use crate::config::Config;
 use crate::engine::lock;
@@ -422,7 +422,7 @@ pub(super) fn count_until_sent(bytes: Bytes, mut unsent: Vec<UnsentBytes>) -> By
 /// The body of a response. The call counts until the body is dropped.
 pub(super) struct CountedReplyBody {
     pub(super) inner: Body,
-    pub(super) _call: Arc<CountedCall>,
+    pub(super) call: Arc<CountedCall>,
 }
 
 impl HttpBody for CountedReplyBody {
@@ -430,7 +430,13 @@ impl HttpBody for CountedReplyBody {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        Pin::new(&mut self.inner).poll_frame(cx)
+        let frame = Pin::new(&mut self.inner).poll_frame(cx);
+        if let Poll::Ready(Some(Ok(frame))) = &frame
+            && frame.is_data()
+        {
+            self.call.send_data();
+        }
+        frame
     }
 
     fn is_end_stream(&self) -> bool {

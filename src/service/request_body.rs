@@ -11,7 +11,7 @@ use tokio::sync::futures::OwnedNotified;
 use tonic::Status;
 use tonic::body::Body;
 
-use super::connection_table::CountedCall;
+use super::open_calls::CountedCall;
 use super::progress_timer::ProgressTimer;
 use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, ReceivedMemory};
 use super::status::to_status;
@@ -97,7 +97,7 @@ impl RequestBody {
         self.timer.reset();
         incomplete.resize(0)?;
         if advance.largest_complete.is_some() {
-            self.call.count();
+            self.call.receive_message();
         }
         if let Some(complete) = complete {
             complete.resize(advance.largest_complete.unwrap_or(0).min(self.limits.max_bytes))?;
@@ -221,8 +221,8 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::admission::{Account, AdmissionMetrics, Client, Limit};
     use crate::config::Config;
-    use crate::service::connection_table::Activity;
     use crate::service::receive_budget::ReceiveBudget;
 
     /// The bytes of messages with these lengths.
@@ -273,7 +273,10 @@ mod tests {
         let (sender, receiver) = tokio::sync::mpsc::channel(8);
         let memory = RequestMemory::new(connection);
         let limits = MessageLimits { max_bytes: 1 << 20, timeout };
-        let call = Activity::new(&Arc::default()).new_call();
+        let account = Account::anonymous(Client::Connection(1));
+        let permit = AdmissionMetrics::default().pool(Limit::CONNECTIONS, 1).acquire(&account);
+        let permit = permit.expect("expected a permit");
+        let call = CountedCall::new(&Arc::default(), permit.handle(), "/");
         (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits, call), sender)
     }
 

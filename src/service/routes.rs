@@ -14,10 +14,11 @@ use tonic::{Code, Status};
 use super::authentication::{Authenticator, Denial};
 use super::caller::AdmittedCall;
 use super::connection::ConnectionInfo;
+use super::interruptible_body::{InterruptibleBody, interruption_of};
+use super::open_calls::CountedCall;
 use super::reply_body::replace_body;
 use super::reply_budget::CountedReplyBody;
 use super::request_body::{RequestBody, RequestMemory};
-use super::revocable_body::{RevocableBody, revoked, revoked_status};
 use super::status::{internal_fault, to_status, transport_status, unknown_method};
 use super::stream::parse_timeout;
 use crate::identity::Credential;
@@ -87,6 +88,9 @@ impl Routes {
                 });
             }
         };
+        if let Some(credential) = &credential {
+            connection.identify(credential.principal());
+        }
         let replies = connection.reply.new_call();
         request.extensions_mut().insert(AdmittedCall { credential: credential.clone(), replies });
         let timeout = request.headers().get("grpc-timeout");
@@ -114,7 +118,7 @@ async fn answer_in_time(
 }
 
 /// Calls a service. Request and response count against the budgets of the connection. The response ends when the
-/// credential is revoked.
+/// credential is revoked or the connection is preempted.
 async fn call_within_budgets(
     route: Route,
     request: Request<Body>,
@@ -123,22 +127,19 @@ async fn call_within_budgets(
 ) -> Result<Response<Body>, Infallible> {
     let memory = RequestMemory::new(&connection.receive);
     let request_memory = memory.clone();
-    let call = connection.activity.new_call();
+    let call = CountedCall::new(&connection.calls, &connection.permit, request.uri().path());
     let request_call = Arc::clone(&call);
     let limits = connection.receive.limits();
     let request = request.map(|body| Body::new(RequestBody::new(body, request_memory, limits, request_call)));
     let response = tokio::select! {
         response = route(request) => response,
-        () = revoked(credential.clone()) => return Ok(revoked_status().into_http()),
+        status = interruption_of(credential.clone(), &connection.permit) => return Ok(status.into_http()),
     };
     memory.release_complete();
     response.map(|response| {
         response.map(|inner| {
-            let body = Body::new(CountedReplyBody { inner, _call: call });
-            match credential {
-                Some(credential) => Body::new(RevocableBody::new(body, credential)),
-                None => body,
-            }
+            let body = Body::new(CountedReplyBody { inner, call });
+            Body::new(InterruptibleBody::new(body, interruption_of(credential, &connection.permit)))
         })
     })
 }

@@ -108,6 +108,7 @@ impl ErrorReport {
             exhausted @ (Error::WindowFull { .. }
             | Error::Busy { .. }
             | Error::LimitReached { .. }
+            | Error::Preempted { .. }
             | Error::OutOfMemory { .. }
             | Error::SlowReader { .. }
             | Error::SlowSubscriber { .. }) => Self::of_exhausted(exhausted),
@@ -151,6 +152,15 @@ impl ErrorReport {
                 let expected = format!("at most {limit} {objects}");
                 Self::new(Code::ResourceExhausted, Reason::LimitReached, expected, "one more")
                     .with_metadata([("object", objects.into()), ("limit", limit.to_string())])
+            }
+            Error::Preempted { objects, held, limit } => {
+                let expected = format!("at most {limit} {objects}, shared with other clients");
+                let given = format!("{held} of this client, and another client that holds less");
+                Self::new(Code::ResourceExhausted, Reason::Preempted, expected, given).with_metadata([
+                    ("object", objects.into()),
+                    ("held", held.to_string()),
+                    ("limit", limit.to_string()),
+                ])
             }
             Error::OutOfMemory { object, memory, asked, available, total } => {
                 let expected = format!("at most {available} bytes of the {memory}");

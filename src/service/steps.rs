@@ -1,15 +1,17 @@
 //! `StepService`: one bidirectional stream per physics process. A stream with the overflow `Block` is not read while
 //! its window is full, so that the flow control of HTTP/2 slows the client down. Every other stream is always read, and
-//! a step that cannot be accepted is answered with a rejection. The stream remains open.
+//! a step that cannot be accepted is answered with a rejection. The stream remains open, but not without a writer lease.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
+use std::time::Duration;
 
 use modalcast_proto::v1;
 use modalcast_proto::v1::drive_scene_request::Kind as RequestKind;
 use modalcast_proto::v1::drive_scene_response::Kind as ResponseKind;
 use tokio::sync::OwnedSemaphorePermit;
+use tokio::time::Instant;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::caller::Caller;
@@ -19,6 +21,8 @@ use super::shared_memory::SharedMemory;
 use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond};
+use crate::admission::PermitHandle;
+use crate::config::Config;
 use crate::engine::{Engine, SceneRight, StepReport, WriterSession};
 use modalcast_model::error::{Error, Result};
 
@@ -54,6 +58,8 @@ impl v1::step_service_server::StepService for StepServiceImpl {
             caller,
             parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits(), memory),
             _drive_permit: drive_permit,
+            open_deadline: OpenDeadline::new(self.engine.config()),
+            connection: connection.permit.clone(),
             inbound: request.into_inner(),
             right_ended: Box::pin(std::future::pending()),
             writer: None,
@@ -85,6 +91,10 @@ struct DriveSession {
     caller: Caller,
     /// Counts this stream among those of its connection.
     _drive_permit: OwnedSemaphorePermit,
+    /// The time by which the writer lease must be acquired.
+    open_deadline: OpenDeadline,
+    /// The permit of the connection.
+    connection: PermitHandle,
     inbound: Streaming<v1::DriveSceneRequest>,
     /// The step that is being received, if it has several parts.
     parts: StepAssembler,
@@ -126,6 +136,7 @@ impl DriveSession {
                         permit.send(reply)?;
                     }
                 }
+                error = self.open_deadline.passed(), if self.writer.is_none() => return Err(to_status(error)),
                 error = &mut self.right_ended => return self.close_with_error(&reply_sender, error).await,
                 () = reply_sender.closed() => return Ok(()),
             }
@@ -138,7 +149,11 @@ impl DriveSession {
     /// `RESOURCE_EXHAUSTED` when the reply queue is full.
     async fn receive(&mut self, message: v1::DriveSceneRequest) -> Result<(), Status> {
         let rejected = match message.kind {
-            Some(RequestKind::Open(open)) => self.open(open).await.err().map(|error| (None, error)),
+            Some(RequestKind::Open(open)) => {
+                let rejected = self.open(open).await.err().map(|error| (None, error));
+                self.open_deadline = OpenDeadline::new(self.engine.config());
+                rejected
+            }
             Some(RequestKind::Step(step)) => {
                 let number = step.number;
                 self.push_step(step).await.err().map(|error| (Some(number), error))
@@ -163,6 +178,7 @@ impl DriveSession {
         let opened = wire_opened(&writer, &request, &scene_handle);
         self.right_ended = Box::pin(scene_handle.right_ended(principal, right));
         self.writer = Some(writer);
+        self.connection.mark_progress();
         self.replies.push_back(v1::DriveSceneResponse { kind: Some(ResponseKind::Opened(opened)) });
         Ok(())
     }
@@ -178,6 +194,9 @@ impl DriveSession {
     /// Appends a report. An acknowledgment also covers all earlier steps. If many replies wait, the acknowledgment
     /// replaces one that is not sent yet. A client that reads nothing can therefore continue to send steps.
     fn push_report(&mut self, report: StepReport) {
+        if matches!(report, StepReport::Done { .. }) {
+            self.connection.mark_progress();
+        }
         let durable_step = self.writer.as_ref().and_then(WriterSession::durable_step);
         let response = to_response(report, durable_step);
         let is_ack = |response: &v1::DriveSceneResponse| matches!(response.kind, Some(ResponseKind::Ack(_)));
@@ -211,6 +230,26 @@ impl DriveSession {
         // Send the error even if the client has not read all replies.
         tokio::time::timeout(timeout, send_replies).await.ok();
         Err(to_status(error))
+    }
+}
+
+/// The time within which a stream must acquire the writer lease, from its begin or its last `open` on. Without it, streams
+/// whose `open` is rejected would stay open.
+#[derive(Debug, Clone, Copy)]
+struct OpenDeadline {
+    deadline: Instant,
+    timeout: Duration,
+}
+
+impl OpenDeadline {
+    fn new(config: &Config) -> Self {
+        let timeout = config.first_request_timeout;
+        Self { deadline: Instant::now() + timeout, timeout }
+    }
+
+    async fn passed(self) -> Error {
+        tokio::time::sleep_until(self.deadline).await;
+        Error::Deadline { what: "an open that is accepted".into(), ms: self.timeout.as_millis() as u64 }
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use modalcast::config::{Authentication, Config, ListenAddress};
 use modalcast_proto::v1;
@@ -107,7 +106,7 @@ async fn rejected_calls_are_counted() {
     }
 }
 
-/// Every connection of the server has a call, so that a further client waits, but not a supervisor.
+/// Supervisors are answered by a full server, and take no connection from its clients.
 #[tokio::test(flavor = "multi_thread")]
 async fn full_server_answers_on_the_admin_listener() {
     let folder = tempfile::tempdir().expect("expected a temporary folder");
@@ -123,22 +122,19 @@ async fn full_server_answers_on_the_admin_listener() {
     let mut stream = states.stream_states(request).await.expect("expected a stream").into_inner();
     writer.send_step_and_wait(step(1, &[], &[])).await;
     with_timeout(stream.message()).await.expect("expected a state");
-    // Control: a third client gets no answer, as long as the two calls are open.
-    let mut waiting = tokio::spawn({
-        let address = server.address.clone();
-        async move {
-            let channel = tonic::transport::Channel::from_shared(address).expect("expected a URL");
-            let channel = channel.connect().await.expect("expected a connection");
-            SceneServiceClient::new(channel).list_scenes(v1::ListScenesRequest {}).await.map(drop)
-        }
-    });
     for _ in 0..20 {
         assert_eq!(self::request(folder.path(), "GET", "/healthz").await.0, 200);
         assert_eq!(self::request(folder.path(), "GET", "/readyz").await.0, 200);
     }
-    assert!(tokio::time::timeout(Duration::from_millis(300), &mut waiting).await.is_err(), "expected a full server");
-    drop((stream, states));
-    with_timeout(waiting).await.expect("expected no panic").expect("expected an answer");
+    writer.send_step_and_wait(step(2, &[], &[])).await;
+    with_timeout(stream.message()).await.expect("expected an open connection");
+    let preempted = "modalcast_preempted_total{resource=\"connections\"}";
+    assert_eq!(sample(folder.path(), preempted).await, Some(0.0));
+    // Control: a third client takes the connection with the least progress.
+    let mut client = SceneServiceClient::new(server.channel().await);
+    with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+    assert_eq!(sample(folder.path(), preempted).await, Some(1.0));
+    drop(stream);
 }
 
 /// Connections that send nothing do not exhaust the listener.

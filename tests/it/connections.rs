@@ -1,14 +1,20 @@
-//! Connections that send no request are closed after a timeout, or at once if the server is full and another client
-//! connects.
+//! A full server ends connections that do not work for new clients. Connections that send no request, and step streams
+//! without a lease, end after a timeout.
 
-use modalcast::config::Config;
+use modalcast::config::{Config, ListenAddress};
 use modalcast_proto::v1;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
-use tokio::net::TcpStream;
-use v1::Delivery;
+use tokio::net::{TcpStream, UnixStream};
+use tonic::Code;
+use tonic_health::pb::health_client::HealthClient;
+use tonic_types::StatusExt as _;
+use v1::drive_scene_response::Kind as ResponseKind;
 use v1::scene_service_client::SceneServiceClient;
+use v1::{Delivery, Reason};
 
-use crate::service_harness::{DEFAULT_WINDOW, SILENCE_LIMIT, Server, StepWriter, step, with_timeout};
+use crate::service_harness::{
+    DEFAULT_WINDOW, SILENCE_LIMIT, Server, StepWriter, rejection_details, step, with_timeout,
+};
 
 /// The preface of HTTP/2 and an empty SETTINGS frame.
 const HELLO: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\x00\x00\x00\x04\x00\x00\x00\x00\x00";
@@ -72,9 +78,9 @@ async fn full_server_closes_connections_without_a_request() {
     }
 }
 
-/// A connection with a stream is not closed. Idle connections get GOAWAY, and the writer continues.
+/// A client that sends steps is not closed. Idle connections get GOAWAY, and the writer continues.
 #[tokio::test(flavor = "multi_thread")]
-async fn full_server_keeps_connections_with_a_stream() {
+async fn full_server_keeps_clients_that_send_steps() {
     let server = small_server(2).await;
     let opener = SceneServiceClient::new(server.channel().await);
     let open = v1::OpenSceneRequest { source: "strips".into(), scene: String::new() };
@@ -87,6 +93,97 @@ async fn full_server_keeps_connections_with_a_stream() {
         with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
         writer.send_step_and_wait(step(number, &[0], &[0.1, 0.2])).await;
     }
+}
+
+/// Calls that only wait do not protect their connections, and end with the reason.
+#[tokio::test(flavor = "multi_thread")]
+async fn full_server_ends_watches_and_rejected_drives_for_new_clients() {
+    let server = small_server(6).await;
+    server.open("strips").await;
+    let mut worker = server.drive_lossless("strips").await;
+    worker.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
+    let mut watches = Vec::new();
+    for _ in 0..2 {
+        let request = tonic_health::pb::HealthCheckRequest { service: String::new() };
+        let watch = HealthClient::new(server.channel().await).watch(request).await;
+        watches.push(watch.expect("expected a stream").into_inner());
+    }
+    let mut drives = Vec::new();
+    for _ in 0..2 {
+        let mut drive = StepWriter::connect(server.channel().await).await;
+        assert!(matches!(drive.open("none", Delivery::Lossless, DEFAULT_WINDOW).await, ResponseKind::Rejection(_)));
+        drives.push(drive);
+    }
+    let mut clients = Vec::new();
+    for number in 2..=6 {
+        let mut client = SceneServiceClient::new(server.channel().await);
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+        clients.push(client);
+        worker.send_step_and_wait(step(number, &[0], &[0.1, 0.2])).await;
+    }
+    let mut ends = Vec::new();
+    for mut watch in watches {
+        ends.push(loop {
+            match with_timeout(watch.message()).await {
+                Ok(message) => assert!(message.is_some(), "expected an error at the end of the stream"),
+                Err(status) => break status,
+            }
+        });
+    }
+    for mut drive in drives {
+        ends.push(with_timeout(drive.replies.message()).await.expect_err("expected the end of the stream"));
+    }
+    for status in ends {
+        assert_eq!((status.code(), rejection_details(&status).reason()), (Code::ResourceExhausted, Reason::Preempted));
+        let metadata = status.get_details_error_info().expect("expected an ErrorInfo").metadata;
+        let expected = [("object", "connections"), ("held", "1"), ("limit", "6")];
+        assert!(expected.iter().all(|(key, text)| metadata[*key] == *text), "{metadata:?}");
+    }
+}
+
+/// A process of a Unix socket is one client, so that its connections end before the only one of another client.
+#[tokio::test(flavor = "multi_thread")]
+async fn connections_of_one_process_are_one_client() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let path = folder.path().join("socket");
+    let listen = ListenAddress::Unix(path.clone());
+    let limits =
+        |config: Config| Config { listen: [config.listen.clone(), vec![listen]].concat(), connections: 8, ..config };
+    let server = Server::start_with(limits).await;
+    // Idle, and therefore the first to end if connections alone counted.
+    let mut idle_client = SceneServiceClient::new(server.channel().await);
+    with_timeout(idle_client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+    let mut of_process = Vec::new();
+    for _ in 0..7 {
+        let mut connection = UnixStream::connect(&path).await.expect("expected a connection");
+        connection.write_all(HELLO).await.expect("expected an open connection");
+        of_process.push(connection);
+    }
+    let mut refused = UnixStream::connect(&path).await.expect("expected a connection");
+    with_timeout(refused.read_to_end(&mut Vec::new())).await.ok();
+    for _ in 0..4 {
+        let mut client = SceneServiceClient::new(server.channel().await);
+        with_timeout(client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an answer");
+    }
+    with_timeout(of_process[0].read_to_end(&mut Vec::new())).await.ok();
+    with_timeout(idle_client.list_scenes(v1::ListScenesRequest {})).await.expect("expected an open connection");
+}
+
+/// A stream whose `open` is rejected, or that sends none, does not stay open.
+#[tokio::test(flavor = "multi_thread")]
+async fn step_stream_without_a_lease_ends_in_time() {
+    let server = Server::start_with(|config| Config { first_request_timeout: SILENCE_LIMIT, ..config }).await;
+    server.open("strips").await;
+    let mut worker = server.drive_lossless("strips").await;
+    let silent = StepWriter::connect(server.channel().await).await;
+    let mut rejected = StepWriter::connect(server.channel().await).await;
+    assert!(matches!(rejected.open("strips", Delivery::Lossless, 0).await, ResponseKind::Rejection(_)));
+    for mut drive in [silent, rejected] {
+        let status = with_timeout(drive.replies.message()).await.expect_err("expected the end of the stream");
+        let reason = rejection_details(&status).reason();
+        assert_eq!((status.code(), reason), (Code::DeadlineExceeded, Reason::DeadlineExpired));
+    }
+    worker.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -1,6 +1,7 @@
 """A well-behaved client, and the times that it sees."""
 
 import hashlib
+import http.client
 import sys
 import time
 from pathlib import Path
@@ -60,9 +61,9 @@ class Client:
     def __exit__(self, *_):
         self.channel.close()
 
-    def open_scene(self, source, name="", timeout=30):
+    def open_scene(self, source, name="", timeout=30, metadata=()):
         request = scenes_pb2.OpenSceneRequest(source=source, scene=name)
-        return self.scenes.OpenScene(request, timeout=timeout).scene
+        return self.scenes.OpenScene(request, timeout=timeout, metadata=metadata).scene
 
     def list_reply(self, timeout=30):
         return self.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=timeout)
@@ -74,10 +75,10 @@ class Client:
 class Writer:
     """A step stream of a scene."""
 
-    def __init__(self, client, scene):
+    def __init__(self, client, scene, metadata=()):
         self.number = 0
         self.requests = []
-        self.replies = client.steps.DriveScene(self.send(scene))
+        self.replies = client.steps.DriveScene(self.send(scene), metadata=metadata)
         next(self.replies)
 
     def send(self, scene):
@@ -123,13 +124,14 @@ def upload_files(client, name, files, timeout=60):
     return client.scenes.UploadScene(upload_parts(name, files), timeout=timeout).scene
 
 
-def time_to_serve(server, timeout):
+def time_to_serve(server, timeout, metadata=()):
     """Seconds until a new client has connected and has the list of scenes. `timeout` if it takes longer."""
     start = time.monotonic()
     while (remaining := start + timeout - time.monotonic()) > 0:
         with Client(server) as client:
             try:
-                client.scenes.ListScenes(scenes_pb2.ListScenesRequest(), timeout=remaining, wait_for_ready=True)
+                request = scenes_pb2.ListScenesRequest()
+                client.scenes.ListScenes(request, timeout=remaining, wait_for_ready=True, metadata=metadata)
                 return time.monotonic() - start
             except grpc.RpcError:
                 # The connection was closed before its first request was received. A client tries again.
@@ -137,11 +139,32 @@ def time_to_serve(server, timeout):
     return timeout
 
 
-def slowest_service(server, seconds, timeout, pause=0.2):
-    """The longest `time_to_serve` of clients that arrive one after another for a time."""
+def service_times(server, seconds, timeout, pause=0.2, metadata=()):
+    """The `time_to_serve` of clients that arrive one after another for a time."""
     deadline = time.monotonic() + seconds
-    slowest = 0.0
+    times = []
     while time.monotonic() < deadline:
-        slowest = max(slowest, time_to_serve(server, timeout))
+        times.append(time_to_serve(server, timeout, metadata))
         time.sleep(pause)
-    return slowest
+    return times
+
+
+def slowest_service(server, seconds, timeout, pause=0.2):
+    """The longest of `service_times`."""
+    return max(service_times(server, seconds, timeout, pause))
+
+
+def health_time(server, timeout):
+    """Seconds until a new connection has an answer of /healthz. `timeout` if it takes longer."""
+    start = time.monotonic()
+    while (remaining := start + timeout - time.monotonic()) > 0:
+        connection = http.client.HTTPConnection(server.address, timeout=remaining)
+        try:
+            connection.request("GET", "/healthz")
+            if connection.getresponse().status == 200:
+                return time.monotonic() - start
+        except (OSError, http.client.HTTPException):
+            time.sleep(0.01)
+        finally:
+            connection.close()
+    return timeout

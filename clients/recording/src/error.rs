@@ -92,6 +92,7 @@ const fn reason_exit_code(reason: Reason) -> u8 {
         | Reason::WindowFull
         | Reason::QueueFull
         | Reason::LimitReached
+        | Reason::Preempted
         | Reason::OutOfMemory
         | Reason::SlowReader
         | Reason::Unauthenticated

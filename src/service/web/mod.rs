@@ -133,7 +133,7 @@ impl WebServer {
                 Ok(Err(error)) => tracing::debug!(%error, "a connection ended"),
                 Err(_) => tracing::debug!("a client has not taken its answer in time"),
             },
-            () = slot.signals.retire.notified() => return None,
+            () = slot.retired() => return None,
         }
         lock(&upgrade).take()
     }

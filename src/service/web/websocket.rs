@@ -247,7 +247,7 @@ impl Calls {
                     Err(reason) => return reason,
                 },
                 Some(ended) = self.tasks.join_next() => check_ended(&ended),
-                () = slot.signals.retire.notified() => {
+                () = slot.retired(), if !self.is_retiring => {
                     self.is_retiring = true;
                     Ok(())
                 }
@@ -303,7 +303,7 @@ impl Calls {
             tokio::time::sleep(WRONG_TOKEN_DELAY).await;
             return Err(CloseReason::unknown_session());
         };
-        self.info.credential = Some(credential);
+        self.info.begin_session(token, credential);
         Ok(())
     }
 

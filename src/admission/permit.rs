@@ -1,0 +1,193 @@
+//! Pools of permits.
+
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use tokio::sync::Notify;
+
+use super::account::Account;
+use super::grant::{Grant, lock};
+use super::limits::Limit;
+use super::metrics::{AdmissionMetrics, ResourceMetrics};
+use super::sharing::{Decision, Holders, Share};
+use modalcast_model::error::{Error, Result};
+
+/// Shortest time between two log records of the preemptions of a pool.
+const LOG_INTERVAL: Duration = Duration::from_secs(1);
+
+/// The permits of one resource. A clone is shallow.
+#[derive(Debug, Clone)]
+pub struct PermitPool(Arc<Shared>);
+
+#[derive(Debug)]
+struct Shared {
+    limit: &'static Limit,
+    share: Share,
+    metrics: ResourceMetrics,
+    state: Mutex<State>,
+    /// Notified when a permit is dropped.
+    released: Notify,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    holders: Holders,
+    /// Number of preempted permits that are not dropped yet. They no longer count.
+    ending: usize,
+    log: PreemptionLog,
+}
+
+/// Preemptions since the last log record.
+#[derive(Debug, Default)]
+struct PreemptionLog {
+    count: u64,
+    last_record: Option<Instant>,
+}
+
+/// Counts as one of a resource until it is dropped.
+#[derive(Debug)]
+pub struct Permit(PermitHandle);
+
+/// Refers to a permit, and does not keep it.
+#[derive(Debug, Clone)]
+pub struct PermitHandle {
+    pool: Arc<Shared>,
+    grant: Arc<Grant>,
+}
+
+impl AdmissionMetrics {
+    /// A pool of `total` permits that is counted here.
+    pub fn pool(&self, limit: &'static Limit, total: usize) -> PermitPool {
+        let share = Share { total, when_full: limit.when_full };
+        let (metrics, state) = (self.of_resource(limit.resource), Mutex::default());
+        PermitPool(Arc::new(Shared { limit, share, metrics, state, released: Notify::new() }))
+    }
+}
+
+impl PermitPool {
+    /// Grants a permit, if necessary after the preemption of another one.
+    ///
+    /// # Errors
+    /// `LimitReached` when no permit is free and the client has its share, or the client would take the reserve.
+    pub fn acquire(&self, account: &Account) -> Result<Permit> {
+        let mut state = lock(&self.0.state);
+        match state.holders.decide(account, self.0.share) {
+            Decision::Grant => {}
+            Decision::Preempt(victim) => self.0.preempt(&mut state, &victim),
+            Decision::Refuse => {
+                self.0.metrics.refused.inc();
+                let Limit { objects, .. } = *self.0.limit;
+                return Err(Error::LimitReached { objects, limit: self.0.share.total });
+            }
+        }
+        let grant = Grant::new(account);
+        state.holders.insert(account, Arc::clone(&grant));
+        Ok(Permit(PermitHandle { pool: Arc::clone(&self.0), grant }))
+    }
+
+    /// Preempts the permit that is next in order.
+    pub fn preempt_one(&self) {
+        let mut state = lock(&self.0.state);
+        if let Some(victim) = state.holders.find_any(self.0.share) {
+            self.0.preempt(&mut state, &victim);
+        }
+    }
+
+    /// Number of permits that are granted and not preempted.
+    pub fn held(&self) -> usize {
+        lock(&self.0.state).holders.count()
+    }
+
+    /// Number of preempted permits that are not dropped yet.
+    pub fn ending(&self) -> usize {
+        lock(&self.0.state).ending
+    }
+
+    /// Waits until a permit is dropped, also one that was dropped since the last call. For one task at a time. Cancel-safe.
+    pub async fn released(&self) {
+        self.0.released.notified().await;
+    }
+}
+
+impl Shared {
+    fn preempt(&self, state: &mut State, victim: &Arc<Grant>) {
+        let account = lock(&victim.account).clone();
+        let held = state.holders.held_by(&account);
+        state.holders.remove(&account, victim);
+        state.ending += 1;
+        self.metrics.preempted.inc();
+        let (objects, limit) = (self.limit.objects, self.share.total);
+        victim.preemption.send_replace(Some(Error::Preempted { objects, held, limit }));
+        state.log.record(self.limit, limit);
+    }
+}
+
+impl PreemptionLog {
+    fn record(&mut self, limit: &Limit, total: usize) {
+        self.count += 1;
+        if self.last_record.is_none_or(|last_record| last_record.elapsed() >= LOG_INTERVAL) {
+            tracing::warn!(resource = limit.resource, limit = total, count = self.count, "ended for other clients");
+            *self = Self { count: 0, last_record: Some(Instant::now()) };
+        }
+    }
+}
+
+impl Permit {
+    pub const fn handle(&self) -> &PermitHandle {
+        &self.0
+    }
+}
+
+impl PermitHandle {
+    /// Records that the holder works. Takes no lock.
+    pub fn mark_progress(&self) {
+        self.grant.progress.mark();
+    }
+
+    /// Moves an anonymous permit to the account of a principal. Has no effect on a permit of a principal, and then takes no
+    /// lock.
+    pub fn identify(&self, account: impl FnOnce() -> Account) {
+        if self.grant.has_principal.swap(true, Ordering::Relaxed) {
+            return;
+        }
+        let account = account();
+        let mut state = lock(&self.pool.state);
+        let former = std::mem::replace(&mut *lock(&self.grant.account), account.clone());
+        if !self.is_preempted() {
+            state.holders.remove(&former, &self.grant);
+            state.holders.insert(&account, Arc::clone(&self.grant));
+        }
+    }
+
+    /// Waits until the permit is preempted, and returns the error with which its holder ends. Cancel-safe.
+    pub fn preempted(&self) -> impl Future<Output = Error> + Send + use<> {
+        let grant = Arc::clone(&self.grant);
+        async move {
+            let mut preemption = grant.preemption.subscribe();
+            match preemption.wait_for(Option::is_some).await.map(|error| error.clone()) {
+                Ok(Some(error)) => error,
+                // The grant has the sender, so this is never reached.
+                _ => std::future::pending().await,
+            }
+        }
+    }
+
+    pub fn is_preempted(&self) -> bool {
+        self.grant.preemption.borrow().is_some()
+    }
+}
+
+impl Drop for Permit {
+    fn drop(&mut self) {
+        let PermitHandle { pool, grant } = &self.0;
+        let mut state = lock(&pool.state);
+        if self.0.is_preempted() {
+            state.ending -= 1;
+        } else {
+            state.holders.remove(&lock(&grant.account), grant);
+        }
+        drop(state);
+        pool.released.notify_one();
+    }
+}
