@@ -298,7 +298,7 @@ pub struct Config {
     pub device_work_limit: Duration,
     /// Largest deadline of a single request.
     pub max_deadline: Duration,
-    /// Limit on the frame, vertex and state streams of one scene.
+    /// Limit on the frame, vertex and state streams of one scene, which clients share; see `modalcast::admission`.
     pub max_subscribers: usize,
     /// Limit on the single requests that wait for a step of one scene.
     pub max_pending_requests: usize,

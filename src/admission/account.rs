@@ -15,6 +15,8 @@ pub struct Account {
 /// What distinguishes the clients of a principal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Client {
+    /// The server itself, and programs that run the engine in their process.
+    Server,
     /// A session of the viewer, by its token.
     Session(TokenHash),
     /// A process that is connected to a Unix socket, by its id.
@@ -26,6 +28,11 @@ pub enum Client {
 impl Account {
     pub fn new(principal: &Principal, client: Client) -> Self {
         Self { principal: Some(principal.name.as_str().into()), client }
+    }
+
+    /// The account of the server itself.
+    pub fn server() -> Self {
+        Self::new(&Principal::owner(), Client::Server)
     }
 
     pub const fn anonymous(client: Client) -> Self {

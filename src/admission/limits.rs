@@ -30,10 +30,18 @@ impl Limit {
         total: |config| config.connections,
         when_full: WhenFull::Preempt,
     };
+
+    pub const SUBSCRIPTIONS: &'static Self = &Self {
+        resource: "subscriptions",
+        objects: "frame, vertex and state streams of one scene",
+        option: None,
+        total: |config| config.max_subscribers,
+        when_full: WhenFull::Preempt,
+    };
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 1] = [Limit::CONNECTIONS];
+pub const LIMITS: [&Limit; 2] = [Limit::CONNECTIONS, Limit::SUBSCRIPTIONS];
 
 #[cfg(test)]
 mod tests {

@@ -134,6 +134,13 @@ impl PreemptionLog {
 }
 
 impl Permit {
+    /// A permit of a pool of its own.
+    #[cfg(test)]
+    pub(crate) fn for_test(limit: &'static Limit) -> Self {
+        let pool = super::AdmissionMetrics::default().pool(limit, 1);
+        pool.acquire(&Account::server()).expect("expected a free permit")
+    }
+
     pub const fn handle(&self) -> &PermitHandle {
         &self.0
     }
@@ -143,6 +150,11 @@ impl PermitHandle {
     /// Records that the holder works. Takes no lock.
     pub fn mark_progress(&self) {
         self.grant.progress.mark();
+    }
+
+    /// What the permit counts to.
+    pub fn account(&self) -> Account {
+        lock(&self.grant.account).clone()
     }
 
     /// Moves an anonymous permit to the account of a principal. Has no effect on a permit of a principal, and then takes no

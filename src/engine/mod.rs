@@ -128,7 +128,6 @@ struct Shared {
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
     load_permits: LoadPermits,
-    admission_metrics: AdmissionMetrics,
     upload_quota: Arc<UploadQuota>,
     /// Whether every scene of the last run is open or has failed.
     are_scenes_reopened: watch::Sender<bool>,
@@ -193,7 +192,13 @@ impl Engine {
         let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(open_device, config.device_work_limit, owners).await?;
         let shared = Shared {
-            services: SceneServices { device: handle, checkpoints, run_counter, config: Arc::clone(&config) },
+            services: SceneServices {
+                device: handle,
+                checkpoints,
+                run_counter,
+                config: Arc::clone(&config),
+                admission_metrics: AdmissionMetrics::default(),
+            },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
             registry: Registry::new(config.open_scenes, config.client_scenes),
             frame_streams: Arc::default(),
@@ -203,7 +208,6 @@ impl Engine {
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
             load_permits: LoadPermits::new(),
-            admission_metrics: AdmissionMetrics::default(),
             upload_quota,
             are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),
@@ -224,7 +228,7 @@ impl Engine {
 
     /// The counters of refused and preempted permits.
     pub fn admission_metrics(&self) -> &AdmissionMetrics {
-        &self.shared.admission_metrics
+        &self.shared.services.admission_metrics
     }
 
     /// The server's configuration.
@@ -577,6 +581,7 @@ mod tests {
 
     use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
     use super::*;
+    use crate::admission::Account;
     use crate::hang_guard::HANG_GUARD;
 
     const POSITIONS: OutputSpec =
@@ -628,8 +633,10 @@ mod tests {
         let (engine, faulty_scene, control_scene) = start_faulty_engine(folder.path()).await;
         let mut faulty_writer = acquire_writer(&faulty_scene).await;
         let mut control_writer = acquire_writer(&control_scene).await;
-        let mut subscription =
-            faulty_scene.subscribe(POSITIONS, Delivery::Lossless).await.expect("expected a subscription");
+        let mut subscription = faulty_scene
+            .subscribe(&Account::server(), POSITIONS, Delivery::Lossless)
+            .await
+            .expect("expected a subscription");
         assert!(is_done(&send_step(&mut faulty_writer, 1, 0.25).await));
         assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
         await_within_limit(subscription.next()).await.expect("control: expected the first step");
@@ -643,7 +650,8 @@ mod tests {
         assert!(faulty_writer.push_step(step(2, 0.5)).await.is_err_and(|error| is_panic(&error)));
         let end = await_within_limit(subscription.next()).await;
         assert!(end.as_ref().is_err_and(is_panic), "subscription: expected the panic, got {end:?}");
-        let new_subscription = await_within_limit(faulty_scene.subscribe(POSITIONS, Delivery::Latest)).await;
+        let new_subscription =
+            await_within_limit(faulty_scene.subscribe(&Account::server(), POSITIONS, Delivery::Latest)).await;
         assert!(new_subscription.as_ref().is_err_and(is_panic), "expected the panic, got {new_subscription:?}");
 
         let error = engine.find("faulty").expect_err("expected an error for a failed scene");
@@ -819,8 +827,10 @@ mod tests {
         let (engine, faulty_scene, control_scene) = start_faulty_engine(folder.path()).await;
         let mut faulty_writer = acquire_writer(&faulty_scene).await;
         let mut control_writer = acquire_writer(&control_scene).await;
-        let mut subscription =
-            control_scene.subscribe(POSITIONS, Delivery::Latest).await.expect("expected a subscription");
+        let mut subscription = control_scene
+            .subscribe(&Account::server(), POSITIONS, Delivery::Latest)
+            .await
+            .expect("expected a subscription");
         assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
         await_within_limit(subscription.next()).await.expect("control: expected the first step");
         let report = send_step(&mut faulty_writer, 1, InjectedFault::DeviceLost.q()).await;

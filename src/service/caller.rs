@@ -7,6 +7,7 @@ use tonic::{Request, Status};
 use super::connection::ConnectionInfo;
 use super::reply_budget::CallReplies;
 use super::status::{internal_fault, to_status};
+use crate::admission::Account;
 use crate::identity::{Credential, Principal};
 
 /// What [`super::routes`] gives a call: it is in the extensions of the request.
@@ -22,6 +23,8 @@ pub(super) struct AdmittedCall {
 pub(super) struct Caller {
     pub(super) principal: Arc<Principal>,
     pub(super) credential: Arc<Credential>,
+    /// What the permits of the call count to.
+    pub(super) account: Account,
     /// Counts the replies of the call.
     pub(super) replies: Arc<CallReplies>,
     /// Address of the client, for the log.
@@ -35,8 +38,10 @@ impl Caller {
         let call = request.extensions().get::<AdmittedCall>().cloned();
         let AdmittedCall { credential, replies } = call.ok_or_else(|| internal_fault("expected an admitted call"))?;
         let credential = credential.ok_or_else(|| internal_fault("expected a call with a credential"))?;
-        let peer = ConnectionInfo::of(request).map_err(to_status)?.peer().to_owned();
-        Ok(Self { principal: Arc::clone(credential.principal()), credential, replies, peer })
+        let connection = ConnectionInfo::of(request).map_err(to_status)?;
+        let principal = Arc::clone(credential.principal());
+        let (account, peer) = (connection.account(&principal), connection.peer().to_owned());
+        Ok(Self { principal, credential, account, replies, peer })
     }
 
     /// Logs a change of a scene, and whether it has succeeded.

@@ -123,7 +123,12 @@ impl ConnectionInfo {
 
     /// Counts the connection to the principal of a call, unless it counts to one already.
     pub(super) fn identify(&self, principal: &Principal) {
-        self.permit.identify(|| Account::new(principal, self.client));
+        self.permit.identify(|| self.account(principal));
+    }
+
+    /// The account of calls of a principal on this connection.
+    pub(super) fn account(&self, principal: &Principal) -> Account {
+        Account::new(principal, self.client)
     }
 
     /// Name of the client, for the log: its address, or its process.

@@ -102,10 +102,9 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         request: Request<v1::StreamFramesRequest>,
     ) -> Result<Response<Self::StreamFramesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
-        let client = connection.client(request.metadata()).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
@@ -114,8 +113,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
             parse_pictures(&self.engine, &scene_handle.scene, request.pictures, FrameUse::Stream).map_err(to_status)?;
         let pixels = connection.acquire_stream_pixels(count_pixels(&pictures)).map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe_client(Some(client), output_spec(&pictures), delivery).await;
-        let subscription = subscription.map_err(to_status)?;
+        let subscription =
+            scene_handle.subscribe(&account, output_spec(&pictures), delivery).await.map_err(to_status)?;
         let cameras = subscription.cameras().cloned().ok_or_else(|| to_status(fault("frames", "expected cameras")))?;
         let entry = FrameStreamEntry { scene: Arc::clone(&scene_handle.scene), cameras };
         let registration = self.engine.register_frame_stream(entry).map_err(to_status)?;

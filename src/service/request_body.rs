@@ -221,7 +221,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics, Client, Limit};
+    use crate::admission::{Limit, Permit};
     use crate::config::Config;
     use crate::service::receive_budget::ReceiveBudget;
 
@@ -273,10 +273,7 @@ mod tests {
         let (sender, receiver) = tokio::sync::mpsc::channel(8);
         let memory = RequestMemory::new(connection);
         let limits = MessageLimits { max_bytes: 1 << 20, timeout };
-        let account = Account::anonymous(Client::Connection(1));
-        let permit = AdmissionMetrics::default().pool(Limit::CONNECTIONS, 1).acquire(&account);
-        let permit = permit.expect("expected a permit");
-        let call = CountedCall::new(&Arc::default(), permit.handle(), "/");
+        let call = CountedCall::new(&Arc::default(), Permit::for_test(Limit::CONNECTIONS).handle(), "/");
         (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits, call), sender)
     }
 

@@ -68,16 +68,13 @@ impl v1::state_service_server::StateService for StateServiceImpl {
         request: Request<v1::StreamStatesRequest>,
     ) -> Result<Response<Self::StreamStatesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
-        let client =
-            ConnectionInfo::of(&request).and_then(|info| info.client(request.metadata())).map_err(to_status)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
         let scene_handle = self.0.find_opened(&request.scene, &principal, right).await.map_err(to_status)?;
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe_client(Some(client), OutputSpec::State, delivery).await;
-        let subscription = subscription.map_err(to_status)?;
+        let subscription = scene_handle.subscribe(&account, OutputSpec::State, delivery).await.map_err(to_status)?;
         let settings = v1::StateStreamSettings {
             delivery: request.delivery,
             max_hz: request.max_hz,

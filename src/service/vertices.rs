@@ -74,10 +74,8 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         request: Request<v1::StreamVerticesRequest>,
     ) -> Result<Response<Self::StreamVerticesStream>, Status> {
         let deadline = Deadline::of_stream(request.metadata());
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
-        let client =
-            ConnectionInfo::of(&request).and_then(|info| info.client(request.metadata())).map_err(to_status)?;
         let request = request.into_inner();
         let delivery = parse_stream_delivery(request.delivery, request.max_hz).map_err(to_status)?;
         let right = right_to_receive(delivery);
@@ -85,7 +83,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         let selection = parse_vertex_selection(&scene_handle.scene, request.selection).map_err(to_status)?;
         let spec = OutputSpec::Vertices(selection.vertex_attributes());
         // Subscribe before the response headers are sent, so that a client can rely on receiving the next step.
-        let subscription = scene_handle.subscribe_client(Some(client), spec, delivery).await.map_err(to_status)?;
+        let subscription = scene_handle.subscribe(&account, spec, delivery).await.map_err(to_status)?;
         let right_ended = scene_handle.right_ended(&principal, right);
         let vertex_stream = VertexStream {
             selection,

@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use modalcast::admission::Account;
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{Delivery, OutputSpec};
 use modalcast_compute::reference::{self, ReferenceDeformer};
@@ -249,13 +250,13 @@ async fn subscribers_of_different_attributes_get_every_step() {
     for selection in selections {
         subscriptions.push(
             scene_handle
-                .subscribe(OutputSpec::Vertices(selection), Delivery::Lossless)
+                .subscribe(&Account::server(), OutputSpec::Vertices(selection), Delivery::Lossless)
                 .await
                 .expect("expected a subscription"),
         );
     }
     let mut latest_subscription = scene_handle
-        .subscribe(OutputSpec::Vertices(VertexAttributes::ALL), Delivery::Latest)
+        .subscribe(&Account::server(), OutputSpec::Vertices(VertexAttributes::ALL), Delivery::Latest)
         .await
         .expect("expected a subscription");
     let steps: Vec<_> = (0..STEP_COUNT).map(|number| step(number, &[1], &[0.01 * number as f32, 1.0])).collect();

@@ -110,6 +110,7 @@ async fn broken_streams_release_their_subscriptions() {
         |config| Config { backend: BackendChoice::Cpu, renderer: RendererChoice::Auto, max_subscribers: 1, ..config };
     let server = Server::start_with(limits).await;
     server.open("sheet").await;
+    let scene_handle = server.engine.find("sheet").expect("expected an open scene");
     let direct_channel = server.channel().await;
     let mut writer = server.drive("sheet", Delivery::Lossless, 16).await;
     let mut number = 0;
@@ -123,7 +124,7 @@ async fn broken_streams_release_their_subscriptions() {
         while streams.len() < limit {
             streams.push(poll(async || subscribe(&channel).await.ok()).await);
         }
-        let refused = subscribe(&direct_channel).await;
+        let refused = subscribe(&channel).await;
         assert_eq!(reason_of(refused), Reason::LimitReached, "control: {kind:?}");
         for stream in &mut streams {
             with_timeout(stream.next()).await.expect("expected a first message").expect("expected no error");
@@ -138,8 +139,13 @@ async fn broken_streams_release_their_subscriptions() {
             let reply = writer.receive_reply().await;
             assert!(matches!(&reply, ResponseKind::Ack(ack) if ack.step == number), "{kind:?} {how:?}: {reply:?}");
         }
+        // Otherwise the next client would preempt a broken one.
+        let is_free = async || (scene_handle.subscription_count() == 0).then_some(());
+        poll(is_free).await;
         drop(poll(async || subscribe(&direct_channel).await.ok()).await);
+        poll(is_free).await;
     }
+    assert_eq!(server.preempted("subscriptions"), 0, "expected only free permits");
 }
 
 /// The scene admits one waiting request.

@@ -50,6 +50,7 @@ mod service_files;
 mod service_harness;
 mod shared_memory;
 mod shared_memory_faults;
+mod shares;
 mod stall_budget;
 mod states;
 mod steps;

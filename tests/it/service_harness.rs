@@ -320,6 +320,11 @@ impl Server {
         writer
     }
 
+    /// Number of permits of a resource that were preempted.
+    pub(crate) fn preempted(&self, resource: &'static str) -> u64 {
+        self.engine.admission_metrics().preempted.get_or_create(&[("resource", resource)]).get()
+    }
+
     /// Stops the server and waits for its end.
     pub(crate) async fn stop(mut self) -> Result<()> {
         self.stop_sender.take().expect("expected a running server").send(()).ok();

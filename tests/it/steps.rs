@@ -1,6 +1,7 @@
 //! Steps over the wire: vertices of acknowledged steps, back-pressure, one writer after another, and requests that wait
 //! for a step.
 
+use modalcast::admission::Account;
 use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
@@ -19,7 +20,7 @@ fn vertex_request(scene: &str) -> v1::GetVerticesRequest {
 async fn subscribe_vertices(server: &Server, delivery: Delivery) -> Subscription {
     let scene = server.engine.find("strips").expect("expected an open scene");
     let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
-    scene.subscribe(spec, delivery).await.expect("expected a subscription")
+    scene.subscribe(&Account::server(), spec, delivery).await.expect("expected a subscription")
 }
 
 #[tokio::test(flavor = "multi_thread")]

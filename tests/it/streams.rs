@@ -3,6 +3,7 @@
 
 use std::sync::Arc;
 
+use modalcast::admission::Account;
 use modalcast::config::{BackendChoice, Config, RendererChoice};
 use modalcast::engine::{
     Delivery, DeviceContext, FrameOutput, OutputBody, OutputSpec, PictureSpec, Pixels, StepFrames, StepOutput,
@@ -95,20 +96,28 @@ async fn frames_of_many_cameras_show_their_own_step() {
     let mut subscriptions = Vec::new();
     for camera in &cameras {
         subscriptions.push(
-            scene_handle.subscribe(frame_output(*camera), Delivery::Lossless).await.expect("expected a subscription"),
+            scene_handle
+                .subscribe(&Account::server(), frame_output(*camera), Delivery::Lossless)
+                .await
+                .expect("expected a subscription"),
         );
     }
     let positions = modalcast_model::deform::VertexAttributes { positions: true, ..Default::default() };
     let mut vertex_subscription = scene_handle
-        .subscribe(OutputSpec::Vertices(positions), Delivery::Lossless)
+        .subscribe(&Account::server(), OutputSpec::Vertices(positions), Delivery::Lossless)
         .await
         .expect("expected a subscription");
     // One subscription is dropped at step 8, and one is never read.
     let mut dropped_subscription = Some(
-        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Lossless).await.expect("expected a subscription"),
+        scene_handle
+            .subscribe(&Account::server(), frame_output(cameras[0]), Delivery::Lossless)
+            .await
+            .expect("expected a subscription"),
     );
-    let _unread_subscription =
-        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Latest).await.expect("expected a subscription");
+    let _unread_subscription = scene_handle
+        .subscribe(&Account::server(), frame_output(cameras[0]), Delivery::Latest)
+        .await
+        .expect("expected a subscription");
     let mut writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
     for step in steps() {
         writer.send_step(step).await;
@@ -162,8 +171,9 @@ async fn pictures_of_one_subscription_show_the_same_step() {
     };
     let depth = PictureSpec { output: FrameOutput::Depth, ..color(&cameras[0]) };
     let pictures = cameras.iter().map(color).chain([depth]).collect();
-    let subscribe =
-        async |spec| scene_handle.subscribe(spec, Delivery::Lossless).await.expect("expected a subscription");
+    let subscribe = async |spec| {
+        scene_handle.subscribe(&Account::server(), spec, Delivery::Lossless).await.expect("expected a subscription")
+    };
     let mut all_cameras = subscribe(OutputSpec::Frames(pictures)).await;
     let mut last_camera = subscribe(frame_output(cameras[4])).await;
     let mut writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
@@ -197,8 +207,10 @@ async fn pictures_of_one_subscription_show_the_same_step() {
 async fn closing_a_scene_delivers_frames_in_flight() {
     let (server, cameras) = (start_server().await, cameras(2));
     let scene_handle = Arc::clone(&server.engine.find("attributes").expect("expected an open scene"));
-    let mut subscription =
-        scene_handle.subscribe(frame_output(cameras[0]), Delivery::Lossless).await.expect("expected a subscription");
+    let mut subscription = scene_handle
+        .subscribe(&Account::server(), frame_output(cameras[0]), Delivery::Lossless)
+        .await
+        .expect("expected a subscription");
     let writer = server.drive("attributes", v1::Delivery::Lossless, 40).await;
     for step in steps().into_iter().take(12) {
         writer.send_step(step).await;

@@ -253,7 +253,8 @@ async fn server_stops_without_credit_and_resumes() {
 /// The 33rd call is rejected with the details of other errors. It succeeds when another call has ended.
 #[tokio::test(flavor = "multi_thread")]
 async fn number_of_calls_is_limited() {
-    let server = default_server().await;
+    // A single client may have 56 of these streams.
+    let server = Server::start_with(|config| Config { max_subscribers: 64, ..config }).await;
     server.open("strips").await;
     let mut client = WebSocketClient::connect(&server).await;
     let request = v1::StreamVerticesRequest {

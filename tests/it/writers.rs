@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use modalcast::admission::Account;
 use modalcast::config::Config;
 use modalcast::engine::{Delivery as EngineDelivery, OutputSpec, Subscription};
 use modalcast_client::{Client, Delivery as ClientDelivery, DriveRequest, StateLayout, StateRequest, Step};
@@ -50,7 +51,7 @@ async fn rejection_of(server: &Server, request: OpenDrive) -> v1::Rejection {
 async fn subscribe(server: &Server, scene: &str) -> Subscription {
     let scene_handle = server.engine.find(scene).expect("expected an open scene");
     let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
-    scene_handle.subscribe(spec, EngineDelivery::Lossless).await.expect("expected a subscription")
+    scene_handle.subscribe(&Account::server(), spec, EngineDelivery::Lossless).await.expect("expected a subscription")
 }
 
 /// A client sends steps without reading replies. Back-pressure slows it down, and no step is rejected or lost.

@@ -41,6 +41,7 @@ use super::message::Message;
 use super::output_delivery::OutputDelivery;
 use super::output_producer::{DeliveryMode, SceneOnDevice};
 use super::step_queue::{CompletedStep, QueuedStep, StepQueue};
+use crate::admission::AdmissionMetrics;
 use crate::config::ValidatedConfig;
 use crate::engine::blocking::run_blocking;
 use crate::engine::catch_unwind::catch_unwind_async;
@@ -61,6 +62,7 @@ pub(in crate::engine) struct SceneServices {
     pub checkpoints: Arc<CheckpointStore>,
     pub run_counter: Arc<RunCounter>,
     pub config: Arc<ValidatedConfig>,
+    pub admission_metrics: AdmissionMetrics,
 }
 
 /// Arguments of [`SceneActor::new`]: a scene that is loaded on the device and deformed to `state`.
@@ -166,7 +168,7 @@ pub(super) struct SceneActor {
 impl SceneActor {
     pub(super) fn new(params: ActorParams, services: SceneServices) -> Self {
         let ActorParams { name, id, scene, state, wake, current_state, failure, on_failure, memory } = params;
-        let SceneServices { device, checkpoints, run_counter, config } = services;
+        let SceneServices { device, checkpoints, run_counter, config, .. } = services;
         let scene_on_device = SceneOnDevice { name: name.clone(), id };
         Self {
             delivery: OutputDelivery::new(scene_on_device, device.clone(), &config),
@@ -326,7 +328,8 @@ impl SceneActor {
                 reply.send(self.acquire_writer(request).await).ok();
             }
             Message::Subscribe { subscriber, reply } => {
-                reply.send(self.delivery.add_subscriber(subscriber, &self.current)).ok();
+                self.delivery.add_subscriber(subscriber, &self.current);
+                reply.send(Ok(())).ok();
             }
             Message::Request(request) => self.delivery.add_request(request),
             // Handled in `serve`.

@@ -145,6 +145,7 @@ mod tests {
 
     use super::super::subscriber::Subscriber;
     use super::*;
+    use crate::admission::{Limit, Permit};
     use crate::engine::output::frame_encoder::tests::{noise_frame, paused_encoder};
     use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
     use crate::engine::output::step_output::{OutputBody, StepOutput};
@@ -162,7 +163,8 @@ mod tests {
     fn subscribe_to(size: FrameSize, delivery: Delivery) -> (Subscriber, Subscription) {
         let camera = CameraSource::framing(&testing::two_strips(), size);
         let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
-        Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
+        let permit = Permit::for_test(Limit::SUBSCRIPTIONS);
+        Subscription::new(permit, OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
     }
 
     fn send_frame(subscriber: &Subscriber, frame: StepOutput) {

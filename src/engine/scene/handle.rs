@@ -13,6 +13,7 @@ use super::lease::{AcquiredLease, InitialState, LeaseRequest, LeaseToken, Writer
 use super::message::{Message, StepRequest, StepSelector};
 use super::step_queue::{Overflow, QueuedStep, StepReport};
 use super::subscriber::Subscription;
+use crate::admission::{Account, Limit, PermitPool};
 use crate::engine::blocking::run_blocking;
 use crate::engine::content::ContentHashes;
 use crate::engine::device::command::SceneId;
@@ -22,7 +23,6 @@ use crate::engine::scene_memory::SceneMemory;
 use crate::engine::storage::checkpoint_store::SceneCheckpoints;
 use crate::engine::storage::provenance::SceneProvenance;
 use crate::engine::storage::scene_record::{SceneAccess, SceneRight, SharedAccess};
-use crate::engine::upload_quota::ClientId;
 use crate::identity::Principal;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
@@ -50,6 +50,7 @@ pub struct SceneHandle {
     mailbox: mpsc::Sender<Message>,
     /// The state of the last completed step, or the rest state.
     current_state: watch::Receiver<Arc<SceneState>>,
+    subscriptions: PermitPool,
     /// Created when forces are applied or read for the first time.
     forces: OnceLock<Arc<ForceChannel>>,
     /// Wakes the actor when a subscription grants a credit, which permits one more result, or is dropped.
@@ -103,6 +104,7 @@ impl SceneHandle {
         };
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
+        let subscriptions = services.admission_metrics.pool(Limit::SUBSCRIPTIONS, services.config.max_subscribers);
         let failure = Arc::new(OnceLock::new());
         let checkpoints = SceneCheckpoints::new(Arc::clone(&services.checkpoints), name.clone());
         let (state_sender, current_state) = watch::channel(Arc::clone(&state));
@@ -129,6 +131,7 @@ impl SceneHandle {
             max_window,
             mailbox,
             current_state,
+            subscriptions,
             forces: OnceLock::new(),
             wake,
             stop_error: OnceLock::new(),
@@ -231,31 +234,27 @@ impl SceneHandle {
         }
     }
 
-    /// Subscribes this process to the scene's steps, as [`Self::subscribe_client`] does for a client.
+    /// Subscribes to the scene's steps. The subscription is active when this returns, and counts to `account`.
     ///
     /// # Errors
-    /// Those of [`Self::subscribe_client`].
-    pub async fn subscribe(&self, spec: OutputSpec, delivery: impl Into<StreamDelivery>) -> Result<Subscription> {
-        self.subscribe_client(None, spec, delivery.into()).await
-    }
-
-    /// Subscribes a client to the scene's steps. The subscription is active when this returns. The subscriptions of one
-    /// client share what they may use of the stall budget.
-    ///
-    /// # Errors
-    /// `Unavailable` when frames are requested and there is no renderer; `LimitReached` when there are too many
-    /// subscribers; `Busy` when the mailbox is full; `NotFound` when the scene is closed.
-    pub async fn subscribe_client(
+    /// `Unavailable` when frames are requested and there is no renderer; `LimitReached` when the client has its share of
+    /// the subscriptions; `Busy` when the mailbox is full; `NotFound` when the scene is closed.
+    pub async fn subscribe(
         &self,
-        client: Option<ClientId>,
+        account: &Account,
         spec: OutputSpec,
-        delivery: StreamDelivery,
+        delivery: impl Into<StreamDelivery>,
     ) -> Result<Subscription> {
         self.check_spec(&spec)?;
-        let (mut subscriber, subscription) = Subscription::new(spec, delivery, Arc::clone(&self.wake));
-        subscriber.client = client;
+        let permit = self.subscriptions.acquire(account)?;
+        let (subscriber, subscription) = Subscription::new(permit, spec, delivery.into(), Arc::clone(&self.wake));
         self.call(|reply| Message::Subscribe { subscriber, reply }).await?;
         Ok(subscription)
+    }
+
+    /// Number of frame, vertex and state streams.
+    pub fn subscription_count(&self) -> usize {
+        self.subscriptions.held()
     }
 
     /// Waits for a step and returns an output of it. Dropping the future cancels the request unless its output is

@@ -25,7 +25,6 @@ const MIN_STALL_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 pub(super) struct OutputDelivery {
     subscribers: Vec<Subscriber>,
     requests: Vec<StepRequest>,
-    max_subscribers: usize,
     max_pending_requests: usize,
     stall_budget: StallBudget,
     /// When a subscriber may exceed the stall budget. `None` while the writer does not wait.
@@ -38,7 +37,6 @@ impl OutputDelivery {
         Self {
             subscribers: Vec::new(),
             requests: Vec::new(),
-            max_subscribers: config.max_subscribers,
             max_pending_requests: config.max_pending_requests,
             stall_budget: StallBudget::new(config.stall_budget, Instant::now()),
             next_stall_check: None,
@@ -46,25 +44,18 @@ impl OutputDelivery {
         }
     }
 
-    /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step unless the scene has had no step.
-    ///
-    /// # Errors
-    /// `LimitReached` when the scene has too many subscribers.
-    pub(super) fn add_subscriber(&mut self, mut subscriber: Subscriber, current: &CurrentStep) -> Result<()> {
+    /// Adds a subscriber. With [`Delivery::Latest`] it receives the current step unless the scene has had no step. The
+    /// permits of the subscriptions bound their number.
+    pub(super) fn add_subscriber(&mut self, mut subscriber: Subscriber, current: &CurrentStep) {
         self.drop_closed_subscribers();
-        let limit = self.max_subscribers;
-        if self.subscribers.len() >= limit {
-            return Err(Error::LimitReached { objects: "subscribers of one scene", limit });
-        }
         let receives_current = subscriber.delivery == Delivery::Latest && current.state.run > 0;
         // Counts as if the subscriber had received the step before its first one.
         subscriber.delivered_step_count =
             if receives_current { current.step_count.saturating_sub(1) } else { current.step_count };
-        let same_client = self.subscribers.iter().find(|other| other.client == subscriber.client);
+        let same_client = self.subscribers.iter().find(|other| other.account == subscriber.account);
         subscriber.stall_time =
             same_client.map_or_else(|| self.stall_budget.new_client(Instant::now()), |other| other.stall_time);
         self.subscribers.push(subscriber);
-        Ok(())
     }
 
     /// Adds a request. Answers it with `Busy` when too many requests wait.
@@ -97,13 +88,13 @@ impl OutputDelivery {
         if self.next_stall_check.take().is_none() {
             return;
         }
-        let end_stall = |subscriber: &mut Subscriber| Some((subscriber.client.clone(), subscriber.end_stall(now)?));
+        let end_stall = |subscriber: &mut Subscriber| Some((subscriber.account.clone(), subscriber.end_stall(now)?));
         let stalls: Vec<_> = self.subscribers.iter_mut().filter_map(end_stall).collect();
         let longest_stall = stalls.iter().map(|(_, stall)| *stall).max();
         self.stall_budget.spend(longest_stall.unwrap_or_default(), now);
         // All subscriptions of a client share its stall time.
         for subscriber in &mut self.subscribers {
-            let of_client = stalls.iter().filter(|(client, _)| *client == subscriber.client);
+            let of_client = stalls.iter().filter(|(account, _)| *account == subscriber.account);
             let longest_stall = of_client.map(|(_, stall)| *stall).max();
             subscriber.stall_time.add(longest_stall.unwrap_or_default(), now);
         }

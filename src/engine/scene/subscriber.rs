@@ -17,10 +17,10 @@ use super::delivery::{Delivery, StreamDelivery};
 use super::frame_stream::{CameraControl, CameraState};
 use super::stall_budget::StallTime;
 use super::work_timer::WorkTimer;
+use crate::admission::{Account, Permit};
 use crate::engine::lock::lock;
 use crate::engine::output::output_spec::{OutputSpec, PictureContent};
 use crate::engine::output::step_output::StepOutput;
-use crate::engine::upload_quota::ClientId;
 use modalcast_model::error::{Error, Result, fault};
 
 /// Number of results that a lossless subscriber may leave unread before it blocks the writer. Also the capacity of the
@@ -50,8 +50,8 @@ pub(in crate::engine) struct Subscriber {
     pub delivery: Delivery,
     /// The scene's step count at this subscriber's last result.
     pub delivered_step_count: u64,
-    /// The client of the subscription; `None` for this process.
-    pub client: Option<ClientId>,
+    /// The client of the subscription.
+    pub account: Account,
     /// How long the writer has waited for this client.
     pub(super) stall_time: StallTime,
     /// Set while the writer waits for this subscriber.
@@ -167,6 +167,7 @@ pub struct Subscription {
     credits: Arc<AtomicUsize>,
     results: mpsc::Receiver<StepOutput>,
     end: watch::Receiver<Option<EndReason>>,
+    permit: Permit,
     /// Wakes the scene: a credit was granted or the subscription was dropped.
     scene_wake: Arc<Notify>,
 }
@@ -174,6 +175,7 @@ pub struct Subscription {
 impl Subscription {
     /// Creates both ends of a subscription. `scene_wake` is notified whenever the subscription grants a credit.
     pub(in crate::engine) fn new(
+        permit: Permit,
         spec: OutputSpec,
         delivery: StreamDelivery,
         scene_wake: Arc<Notify>,
@@ -192,7 +194,7 @@ impl Subscription {
             spec,
             delivery: delivery.delivery(),
             delivered_step_count: 0,
-            client: None,
+            account: permit.handle().account(),
             stall_time: StallTime::new(Duration::ZERO, Instant::now()),
             stall_start: None,
             work_timer: Arc::clone(&work_timer),
@@ -216,6 +218,7 @@ impl Subscription {
             credits,
             results,
             end,
+            permit,
             scene_wake,
         };
         (subscriber, subscription)
@@ -245,8 +248,17 @@ impl Subscription {
     /// Waits for the next result. Cancel-safe.
     ///
     /// # Errors
-    /// The error with which the subscription has ended.
+    /// The error with which the subscription has ended; `Preempted`.
     pub async fn next(&mut self) -> Result<StepOutput> {
+        let preempted = self.permit.handle().preempted();
+        tokio::select! {
+            biased;
+            error = preempted => Err(error),
+            result = self.receive() => result,
+        }
+    }
+
+    async fn receive(&mut self) -> Result<StepOutput> {
         let result = match self.delivery.delivery() {
             Delivery::Lossless => {
                 let result = self.results.recv().await;
@@ -255,7 +267,9 @@ impl Subscription {
             }
             Delivery::Latest => self.receive_latest().await,
         };
-        result.ok_or_else(|| self.end_error())
+        let result = result.ok_or_else(|| self.end_error())?;
+        self.permit.handle().mark_progress();
+        Ok(result)
     }
 
     /// Grants a credit, if necessary after a wait for the rate limit, and waits for its result. `None` if the
@@ -279,16 +293,23 @@ impl Subscription {
         result
     }
 
-    /// Waits until the scene disconnects the subscriber, and returns the reason. Pends forever if the subscription ends
-    /// in another way.
+    /// Waits until the subscription is preempted or the scene disconnects the subscriber, and returns the reason. Pends
+    /// forever if the subscription ends in another way.
     pub fn disconnected(&self) -> impl Future<Output = Error> + Send + use<> {
+        let preempted = self.permit.handle().preempted();
         let mut end_receiver = self.end.clone();
         let is_immediate = |end: &Option<EndReason>| end.as_ref().is_some_and(|end| end.is_immediate);
-        async move {
+        let disconnected = async move {
             match end_receiver.wait_for(is_immediate).await.map(|end| end.clone()) {
                 Ok(Some(end)) => end.error,
                 // The scene has ended without disconnecting the subscriber, so buffered results may still be read.
                 _ => std::future::pending().await,
+            }
+        };
+        async move {
+            tokio::select! {
+                error = disconnected => error,
+                error = preempted => error,
             }
         }
     }
@@ -340,6 +361,7 @@ impl Drop for Subscription {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::admission::Limit;
     use crate::engine::device::handle::PendingReply;
     use crate::engine::output::step_output::{OutputBody, StepId};
     use modalcast_model::deform::VertexAttributes;
@@ -352,7 +374,7 @@ mod tests {
 
     fn subscribe(delivery: impl Into<StreamDelivery>) -> (Subscriber, Subscription) {
         let spec = OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
-        Subscription::new(spec, delivery.into(), Arc::default())
+        Subscription::new(Permit::for_test(Limit::SUBSCRIPTIONS), spec, delivery.into(), Arc::default())
     }
 
     /// A limit that a test never reaches: one result in 1000 s.

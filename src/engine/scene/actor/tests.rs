@@ -8,6 +8,7 @@ use super::super::delivery::Delivery;
 use super::super::handle::{OpenParams, SceneHandle, WriterSession};
 use super::super::subscriber::Subscription;
 use super::*;
+use crate::admission::Account;
 use crate::config::Config;
 use crate::engine::device::command::Command;
 use crate::engine::memory_limits::MemoryLimits;
@@ -45,6 +46,7 @@ impl TestScene {
             checkpoints: Arc::new(CheckpointStore::without_thread(folder.path().into(), &disk)),
             run_counter: Arc::new(RunCounter::open(folder.path(), &disk).expect("expected a new counter")),
             config: Arc::new(config.validated().expect("expected valid defaults")),
+            admission_metrics: AdmissionMetrics::default(),
         };
         let params = OpenParams {
             name: "strips".into(),
@@ -76,7 +78,10 @@ impl TestScene {
             output: FrameOutput::Color,
             style: FrameStyle::default(),
         };
-        self.handle.subscribe(OutputSpec::Frames([picture].into()), delivery).await.expect("expected a subscription")
+        self.handle
+            .subscribe(&Account::server(), OutputSpec::Frames([picture].into()), delivery)
+            .await
+            .expect("expected a subscription")
     }
 
     async fn next_command(&mut self) -> Command {

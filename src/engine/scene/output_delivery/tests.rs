@@ -11,12 +11,12 @@ use super::super::message::StepSelector;
 use super::super::step_queue::{Overflow, QueuedStep, StepQueue, StepReport};
 use super::super::subscriber::Subscription;
 use super::*;
+use crate::admission::{Account, Client, Limit, Permit};
 use crate::engine::device::command::{Command, Reply};
 use crate::engine::output::output_spec::{FrameOutput, OutputSpec, PictureSpec};
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_output::{OutputBody, SharedPicture, StepOutput};
 use crate::engine::testing;
-use crate::engine::upload_quota::ClientId;
 use crate::hang_guard::HANG_GUARD;
 use modalcast_model::scene::{CameraSource, FrameSize, FrameStyle, RawStepUpdate, SceneState, StepUpdate};
 use modalcast_render::{FrameImage, FrameInfo, FramePixels, FrameTimes, MAX_FRAMES_IN_FLIGHT};
@@ -49,7 +49,8 @@ fn subscribe(delivery: Delivery, width: u32) -> (Subscriber, Subscription) {
     let camera = CameraSource::framing(&testing::two_strips(), FrameSize::new(width, 8));
     let size = FrameSize::new(width, 8);
     let picture = PictureSpec { camera, size, output: FrameOutput::Color, style: FrameStyle::default() };
-    Subscription::new(OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
+    let permit = Permit::for_test(Limit::SUBSCRIPTIONS);
+    Subscription::new(permit, OutputSpec::Frames([picture].into()), delivery.into(), Arc::default())
 }
 
 /// Grants the credit of a [`Delivery::Latest`] subscription, which has no result yet.
@@ -277,10 +278,11 @@ async fn frames_in_flight_of_a_step_are_bounded_across_rounds() {
 #[tokio::test]
 async fn late_credit_shares_the_copy_in_flight() {
     let spec = || OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS);
-    let (first_subscriber, mut first_subscription) =
-        Subscription::new(spec(), Delivery::Lossless.into(), Arc::default());
-    let (second_subscriber, mut second_subscription) =
-        Subscription::new(spec(), Delivery::Latest.into(), Arc::default());
+    let subscribe = |delivery: Delivery| {
+        Subscription::new(Permit::for_test(Limit::SUBSCRIPTIONS), spec(), delivery.into(), Arc::default())
+    };
+    let (first_subscriber, mut first_subscription) = subscribe(Delivery::Lossless);
+    let (second_subscriber, mut second_subscription) = subscribe(Delivery::Latest);
     let (mut delivery, mut device) = delivery_to(vec![first_subscriber, second_subscriber]);
     let step = current_step(1);
     delivery.serve_subscribers(&step, WITH_NEXT_STEP).await;
@@ -354,9 +356,10 @@ const STALL_BUDGET: Duration = Duration::from_secs(3600);
 
 /// A lossless subscription to states of a client, which has subscribed long ago.
 fn subscribe_client(client: u64) -> (Subscriber, Subscription) {
+    let permit = Permit::for_test(Limit::SUBSCRIPTIONS);
     let (mut subscriber, subscription) =
-        Subscription::new(OutputSpec::State, Delivery::Lossless.into(), Arc::default());
-    subscriber.client = Some(ClientId::Connection(client));
+        Subscription::new(permit, OutputSpec::State, Delivery::Lossless.into(), Arc::default());
+    subscriber.account = Account::anonymous(Client::Connection(client));
     (subscriber, subscription)
 }
 

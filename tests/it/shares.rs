@@ -1,0 +1,71 @@
+//! Clients share the streams of a scene: one client leaves some for others, and a client without any gets one in any case.
+
+use modalcast::config::Config;
+use modalcast_proto::v1;
+use tonic::transport::Channel;
+use tonic::{Code, Status, Streaming};
+use tonic_types::StatusExt as _;
+use v1::state_service_client::StateServiceClient;
+use v1::{Delivery, Reason};
+
+use crate::service_harness::{Server, rejection_details, step, with_timeout};
+
+type States = Streaming<v1::StreamStatesResponse>;
+
+async fn subscribe(channel: &Channel) -> Result<States, Status> {
+    let delivery = Delivery::Latest.into();
+    let request = v1::StreamStatesRequest { scene: "strips".into(), delivery, ..Default::default() };
+    let mut stream = StateServiceClient::new(channel.clone()).stream_states(request).await?.into_inner();
+    // The first message has the settings.
+    with_timeout(stream.message()).await?;
+    Ok(stream)
+}
+
+/// The error at the end of a stream.
+async fn end_of(mut stream: States) -> Status {
+    loop {
+        match with_timeout(stream.message()).await {
+            Ok(message) => assert!(message.is_some(), "expected an error at the end of the stream"),
+            Err(status) => return status,
+        }
+    }
+}
+
+fn assert_preempted(status: &Status, object: &str, held: usize, limit: usize) {
+    assert_eq!((status.code(), rejection_details(status).reason()), (Code::ResourceExhausted, Reason::Preempted));
+    let metadata = status.get_details_error_info().expect("expected an ErrorInfo").metadata;
+    assert_eq!((metadata["held"].clone(), metadata["limit"].clone()), (held.to_string(), limit.to_string()));
+    assert_eq!(metadata["object"], object);
+}
+
+fn reason_of<T>(result: Result<T, Status>) -> Reason {
+    rejection_details(&result.err().expect("expected an error")).reason()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn streams_of_a_scene_are_shared_between_clients() {
+    let server = Server::start_with(|config| Config { max_subscribers: 8, ..config }).await;
+    server.open("strips").await;
+    let mut writer = server.drive_lossless("strips").await;
+    let greedy = server.channel().await;
+    let mut of_greedy = Vec::new();
+    for _ in 0..7 {
+        of_greedy.push(subscribe(&greedy).await.expect("expected a stream"));
+    }
+    assert_eq!(reason_of(subscribe(&greedy).await), Reason::LimitReached, "expected one stream for others");
+    let mut streams = Vec::new();
+    for count in 1..=4 {
+        streams.push(subscribe(&server.channel().await).await.expect("expected a stream"));
+        // The first of these clients gets the stream that was left.
+        assert_eq!(server.preempted("subscriptions"), count - 1);
+    }
+    let object = "frame, vertex and state streams of one scene";
+    for (held, stream) in [7, 6, 5].into_iter().zip(of_greedy.drain(..3)) {
+        assert_preempted(&end_of(stream).await, object, held, 8);
+    }
+    // The streams of the others, and those that are left, receive the next step.
+    writer.send_step_and_wait(step(1, &[0], &[0.1, 0.2])).await;
+    for stream in streams.iter_mut().chain(&mut of_greedy) {
+        with_timeout(stream.message()).await.expect("expected no error").expect("expected a state");
+    }
+}
