@@ -300,7 +300,7 @@ pub struct Config {
     pub max_deadline: Duration,
     /// Limit on the frame, vertex and state streams of one scene, which clients share; see `modalcast::admission`.
     pub max_subscribers: usize,
-    /// Limit on the single requests that wait for a step of one scene.
+    /// Limit on the single requests that wait for a step of one scene, which clients share.
     pub max_pending_requests: usize,
     /// How long the lossless readers of a scene may make its writer wait: a budget that is refilled by a tenth of the
     /// elapsed time. Readers that exceed it are disconnected. A writer may ask for another budget.

@@ -38,10 +38,18 @@ impl Limit {
         total: |config| config.max_subscribers,
         when_full: WhenFull::Preempt,
     };
+
+    pub const WAITING_REQUESTS: &'static Self = &Self {
+        resource: "waiting_requests",
+        objects: "requests that wait for a step of one scene",
+        option: None,
+        total: |config| config.max_pending_requests,
+        when_full: WhenFull::Preempt,
+    };
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 2] = [Limit::CONNECTIONS, Limit::SUBSCRIPTIONS];
+pub const LIMITS: [&Limit; 3] = [Limit::CONNECTIONS, Limit::SUBSCRIPTIONS, Limit::WAITING_REQUESTS];
 
 #[cfg(test)]
 mod tests {

@@ -94,6 +94,11 @@ impl PermitPool {
         }
     }
 
+    /// Number of permits that can be granted at a time.
+    pub fn total(&self) -> usize {
+        self.0.share.total
+    }
+
     /// Number of permits that are granted and not preempted.
     pub fn held(&self) -> usize {
         lock(&self.0.state).holders.count()

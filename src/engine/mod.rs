@@ -640,7 +640,8 @@ mod tests {
         assert!(is_done(&send_step(&mut faulty_writer, 1, 0.25).await));
         assert!(is_done(&send_step(&mut control_writer, 1, 0.25).await));
         await_within_limit(subscription.next()).await.expect("control: expected the first step");
-        let request = faulty_scene.request_output(StepSelector::Exact { run: 0, number: 99 }, POSITIONS);
+        let account = Account::server();
+        let request = faulty_scene.request_output(&account, StepSelector::Exact { run: 0, number: 99 }, POSITIONS);
         let (output, ()) = await_within_limit(async { tokio::join!(request, faulty_scene.inject_panic()) }).await;
 
         let is_panic = |error: &Error| matches!(error, Error::Fault { reason, .. } if reason.contains("panicked"));

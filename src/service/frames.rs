@@ -44,7 +44,7 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
     ) -> Result<Response<Self::RenderFrameStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
         let request = request.into_inner();
@@ -57,7 +57,8 @@ impl v1::frame_service_server::FrameService for FrameServiceImpl {
         Ok(respond(replies, move |reply_sender| async move {
             let work = async {
                 let _pixels = connection.acquire_frame_pixels(count_pixels(&pictures)).await.map_err(to_status)?;
-                let output = scene_handle.request_output(selector, output_spec(&pictures)).await.map_err(to_status)?;
+                let output =
+                    scene_handle.request_output(&account, selector, output_spec(&pictures)).await.map_err(to_status)?;
                 let mut frames = FrameQueue::new(encoder, formats(&pictures));
                 frames.push(output).map_err(to_status)?;
                 for picture in &pictures {

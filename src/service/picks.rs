@@ -28,7 +28,8 @@ pub(super) async fn respond_to_pick(
     let max_chunk_bytes = engine.config().chunk_bytes;
     Ok(respond(caller.replies, move |reply_sender| async move {
         let work = async {
-            let output = scene_handle.request_output(selector, output_spec).await.map_err(to_status)?;
+            let output =
+                scene_handle.request_output(&caller.account, selector, output_spec).await.map_err(to_status)?;
             let pick_result =
                 resolve_picks(output, &scene_handle.scene, !request.without_modes).await.map_err(to_status)?;
             for response in split_reply(&pick_result, &scene_handle.scene, max_chunk_bytes) {

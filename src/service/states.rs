@@ -41,14 +41,15 @@ impl v1::state_service_server::StateService for StateServiceImpl {
     async fn get_state(&self, request: Request<v1::GetStateRequest>) -> Result<Response<Self::GetStateStream>, Status> {
         let config = self.0.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let request = request.into_inner();
         let scene_handle = self.0.find_opened(&request.scene, &principal, SceneRight::Use).await.map_err(to_status)?;
         let selector = parse_step_selector(request.step);
         let max_chunk_bytes = config.chunk_bytes;
         Ok(respond(replies, move |reply_sender| async move {
             let work = async {
-                let output = scene_handle.request_output(selector, OutputSpec::State).await.map_err(to_status)?;
+                let output =
+                    scene_handle.request_output(&account, selector, OutputSpec::State).await.map_err(to_status)?;
                 let mut reply = reply_sender.reserve_whole(max_state_bytes(&scene_handle.scene)).await?;
                 let packed = pack_state(output, &scene_handle.scene, None).await.map_err(to_status)?;
                 reply.shrink_to(packed.bytes.len() + HEAD_BYTES);

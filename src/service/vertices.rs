@@ -40,7 +40,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
     ) -> Result<Response<Self::GetVerticesStream>, Status> {
         let config = self.engine.config();
         let deadline = Deadline::of_request(request.metadata(), request.get_ref().deadline_ms, config);
-        let Caller { principal, replies, .. } = Caller::of(&request)?;
+        let Caller { principal, account, replies, .. } = Caller::of(&request)?;
         let memory = self.shared_memory.find(request.metadata(), &principal).map_err(to_status)?;
         let request = request.into_inner();
         let scene_handle =
@@ -52,7 +52,7 @@ impl v1::vertex_service_server::VertexService for VertexServiceImpl {
         Ok(respond(replies, move |reply_sender| async move {
             let work = async {
                 let spec = OutputSpec::Vertices(selection.vertex_attributes());
-                let output = scene_handle.request_output(selector, spec).await.map_err(to_status)?;
+                let output = scene_handle.request_output(&account, selector, spec).await.map_err(to_status)?;
                 let vertices = packer.pack(output, &selection, None).await.map_err(to_status)?;
                 for layout in layout_parts(&selection) {
                     reply_sender.send(to_response(SinglePart::Layout(layout))).await?;

@@ -153,6 +153,7 @@ async fn broken_streams_release_their_subscriptions() {
 async fn broken_requests_stop_waiting() {
     let server = Server::start_with(|config| Config { max_pending_requests: 1, ..config }).await;
     server.open("strips").await;
+    let scene_handle = server.engine.find("strips").expect("expected an open scene");
     let request = || v1::GetVerticesRequest { scene: "strips".into(), step: minimum_step(99), ..Default::default() };
     // A request without a reply after 20 poll intervals counts as admitted.
     let try_wait = async |channel: &Channel| {
@@ -168,10 +169,12 @@ async fn broken_requests_stop_waiting() {
         let proxy = Proxy::start(&server).await;
         let channel = proxy.channel().await;
         let waiting = poll(async || try_wait(&channel).await.ok()).await;
-        assert_eq!(reason_of(try_wait(&direct_channel).await), Reason::QueueFull, "control: {how:?}");
+        assert_eq!(reason_of(try_wait(&channel).await), Reason::QueueFull, "control: {how:?}");
         proxy.break_off(how, waiting);
+        poll(async || (scene_handle.waiting_request_count() == 0).then_some(())).await;
     }
     drop(poll(async || try_wait(&direct_channel).await.ok()).await);
+    assert_eq!(server.preempted("waiting_requests"), 0, "expected only free permits");
 }
 
 /// While the arrays of a description are unread, its call holds a reference to the scene.

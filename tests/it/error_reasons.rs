@@ -49,7 +49,8 @@ async fn errors_of_calls() -> Vec<(Code, Reason, Status)> {
     let future_step = v1::GetVerticesRequest { step: minimum_step(99), ..vertex_request("strips") };
     let late_request = v1::GetVerticesRequest { deadline_ms: 50, ..future_step.clone() };
     errors.push((Code::DeadlineExceeded, Reason::DeadlineExpired, vertex_error(&server, late_request).await));
-    let waiting_requests = [server.vertices().await, server.vertices().await].map(|mut client| {
+    let client = server.vertices().await;
+    let waiting_requests = [client.clone(), client].map(|mut client| {
         let request = future_step.clone();
         tokio::spawn(async move { client.get_vertices(request).await?.into_inner().message().await })
     });

@@ -1,14 +1,15 @@
-//! Clients share the streams of a scene: one client leaves some for others, and a client without any gets one in any case.
+//! Clients share the streams and the waiting requests of a scene: one client leaves some for others, and a client without any gets one in any case.
 
 use modalcast::config::Config;
 use modalcast_proto::v1;
+use tokio::task::JoinSet;
 use tonic::transport::Channel;
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt as _;
 use v1::state_service_client::StateServiceClient;
 use v1::{Delivery, Reason};
 
-use crate::service_harness::{Server, rejection_details, step, with_timeout};
+use crate::service_harness::{Server, minimum_step, rejection_details, step, with_timeout};
 
 type States = Streaming<v1::StreamStatesResponse>;
 
@@ -68,4 +69,47 @@ async fn streams_of_a_scene_are_shared_between_clients() {
     for stream in streams.iter_mut().chain(&mut of_greedy) {
         with_timeout(stream.message()).await.expect("expected no error").expect("expected a state");
     }
+}
+
+/// A request that waits for a step that is never sent.
+async fn wait_for_step(channel: &Channel) -> Status {
+    let request = v1::GetStateRequest { scene: "strips".into(), step: minimum_step(99), ..Default::default() };
+    let mut stream = StateServiceClient::new(channel.clone()).get_state(request).await.expect("a stream").into_inner();
+    with_timeout(stream.message()).await.expect_err("expected an error")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn waiting_requests_of_a_scene_are_shared_between_clients() {
+    let server = Server::start_with(|config| Config { max_pending_requests: 8, ..config }).await;
+    server.open("strips").await;
+    let greedy = server.channel().await;
+    let mut of_greedy = JoinSet::new();
+    for _ in 0..8 {
+        let channel = greedy.clone();
+        of_greedy.spawn(async move { wait_for_step(&channel).await });
+    }
+    let refused = with_timeout(of_greedy.join_next()).await.expect("a task").expect("expected no panic");
+    assert_eq!(rejection_details(&refused).reason(), Reason::QueueFull, "expected one request for others");
+    let mut others = JoinSet::new();
+    for count in 1..=4 {
+        let channel = server.channel().await;
+        others.spawn(async move { wait_for_step(&channel).await });
+        while server.preempted("waiting_requests") < count - 1 {
+            tokio::task::yield_now().await;
+        }
+    }
+    let mut ends = Vec::new();
+    for _ in 0..3 {
+        ends.push(with_timeout(of_greedy.join_next()).await.expect("a task").expect("expected no panic"));
+    }
+    ends.sort_by_key(|status| status.message().to_owned());
+    for (status, held) in ends.iter().zip([5, 6, 7]) {
+        assert_preempted(status, "requests that wait for a step of one scene", held, 8);
+    }
+    // A client without a request is answered while all permits are taken.
+    let request = v1::GetStateRequest { scene: "strips".into(), ..Default::default() };
+    let mut states = StateServiceClient::new(server.channel().await);
+    let mut reply = states.get_state(request).await.expect("expected a stream").into_inner();
+    with_timeout(reply.message()).await.expect("expected no error").expect("expected a state");
+    assert!(others.try_join_next().is_none(), "expected the other clients to wait");
 }

@@ -6,6 +6,7 @@ use modalcast::engine::{Delivery, OutputSpec, StepSelector, Subscription};
 use modalcast_model::deform::VertexAttributes;
 use modalcast_proto::v1;
 use v1::drive_scene_response::Kind as ResponseKind;
+use v1::vertex_service_client::VertexServiceClient;
 
 use crate::service_harness::{
     DEFAULT_WINDOW, Server, StepWriter, exact_step, get_vertices, minimum_step, next_vertices, reference_vertices,
@@ -290,11 +291,14 @@ async fn canceled_requests_do_not_count_as_pending() {
             .expect("expected the task not to panic");
         assert_eq!(code, tonic::Code::ResourceExhausted);
     }
-    let error = get_vertices(&server, vertex_request("strips")).await.expect_err("expected a busy error");
+    let get_vertices = async |mut client: VertexServiceClient<tonic::transport::Channel>| {
+        client.get_vertices(vertex_request("strips")).await?.into_inner().message().await
+    };
+    let error = get_vertices(client.clone()).await.expect_err("expected a busy error");
     assert_eq!(error.code(), tonic::Code::ResourceExhausted);
     // Cancels the four pending requests. The server then accepts requests again.
     pending_requests.shutdown().await;
-    let retry = async { while get_vertices(&server, vertex_request("strips")).await.is_err() {} };
+    let retry = async { while get_vertices(client.clone()).await.is_err() {} };
     with_timeout(retry).await;
 }
 
@@ -306,13 +310,18 @@ async fn requests_wait_for_exact_and_minimum_steps() {
     server.open("strips").await;
     let mut writer = server.drive_lossless("strips").await;
     let scene_handle = server.engine.find("strips").expect("expected an open scene");
+    let account = Account::server();
     let mut pending_requests = [
         StepSelector::Exact { run: 0, number: 2 },
         StepSelector::Minimum { run: 0, number: 3 },
         StepSelector::Exact { run: 0, number: 5 },
     ]
     .map(|selector| {
-        Box::pin(scene_handle.request_output(selector, OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS)))
+        Box::pin(scene_handle.request_output(
+            &account,
+            selector,
+            OutputSpec::Vertices(VertexAttributes::POSITIONS_AND_NORMALS),
+        ))
     });
     for pending_request in &mut pending_requests {
         // One poll registers the request.

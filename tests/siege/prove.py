@@ -35,7 +35,7 @@ ITEMS = {
     16: (None, "soak: 16 clients that come and go"),
     17: ("credentials", "callers without a credential, and guessed tokens"),
     18: ("stall_budget", "readers that do not read stop a writer only within its stall budget"),
-    19: ("shares", "one client does not take all streams of a scene"),
+    19: ("shares", "one client does not take all streams and requests of a scene"),
 }
 
 # For items with checks, the part of the subject that is not claimed.

@@ -51,6 +51,7 @@ pub struct SceneHandle {
     /// The state of the last completed step, or the rest state.
     current_state: watch::Receiver<Arc<SceneState>>,
     subscriptions: PermitPool,
+    waiting_requests: PermitPool,
     /// Created when forces are applied or read for the first time.
     forces: OnceLock<Arc<ForceChannel>>,
     /// Wakes the actor when a subscription grants a credit, which permits one more result, or is dropped.
@@ -104,7 +105,9 @@ impl SceneHandle {
         };
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
-        let subscriptions = services.admission_metrics.pool(Limit::SUBSCRIPTIONS, services.config.max_subscribers);
+        let (admission_metrics, config) = (&services.admission_metrics, &services.config);
+        let subscriptions = admission_metrics.pool(Limit::SUBSCRIPTIONS, config.max_subscribers);
+        let waiting_requests = admission_metrics.pool(Limit::WAITING_REQUESTS, config.max_pending_requests);
         let failure = Arc::new(OnceLock::new());
         let checkpoints = SceneCheckpoints::new(Arc::clone(&services.checkpoints), name.clone());
         let (state_sender, current_state) = watch::channel(Arc::clone(&state));
@@ -132,6 +135,7 @@ impl SceneHandle {
             mailbox,
             current_state,
             subscriptions,
+            waiting_requests,
             forces: OnceLock::new(),
             wake,
             stop_error: OnceLock::new(),
@@ -257,15 +261,31 @@ impl SceneHandle {
         self.subscriptions.held()
     }
 
-    /// Waits for a step and returns an output of it. Dropping the future cancels the request unless its output is
-    /// already being produced.
+    /// Number of requests that wait for a step or its output.
+    pub fn waiting_request_count(&self) -> usize {
+        self.waiting_requests.held()
+    }
+
+    /// Waits for a step and returns an output of it. The request counts to `account`. Dropping the future cancels the
+    /// request unless its output is already being produced.
     ///
     /// # Errors
-    /// `StepPassed` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when too many
-    /// requests wait; `NotFound` when the scene is closed.
-    pub async fn request_output(&self, selector: StepSelector, spec: OutputSpec) -> Result<StepOutput> {
+    /// `StepPassed` when the exact step has passed; `Unavailable` when there is no renderer; `Busy` when the client has its
+    /// share of the requests that wait; `Preempted`; `NotFound` when the scene is closed.
+    pub async fn request_output(
+        &self,
+        account: &Account,
+        selector: StepSelector,
+        spec: OutputSpec,
+    ) -> Result<StepOutput> {
         self.check_spec(&spec)?;
-        self.call(|reply| Message::Request(StepRequest { selector, spec, reply })).await
+        let busy = |limit| Error::Busy { queue: "requests that wait for a step", limit };
+        let permit = self.waiting_requests.acquire(account).map_err(|_| busy(self.waiting_requests.total()))?;
+        tokio::select! {
+            biased;
+            error = permit.handle().preempted() => Err(error),
+            output = self.call(|reply| Message::Request(StepRequest { selector, spec, reply })) => output,
+        }
     }
 
     /// Sets all forces of an owner. The scene's task is not involved.

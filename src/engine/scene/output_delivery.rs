@@ -25,7 +25,6 @@ const MIN_STALL_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 pub(super) struct OutputDelivery {
     subscribers: Vec<Subscriber>,
     requests: Vec<StepRequest>,
-    max_pending_requests: usize,
     stall_budget: StallBudget,
     /// When a subscriber may exceed the stall budget. `None` while the writer does not wait.
     next_stall_check: Option<Instant>,
@@ -37,7 +36,6 @@ impl OutputDelivery {
         Self {
             subscribers: Vec::new(),
             requests: Vec::new(),
-            max_pending_requests: config.max_pending_requests,
             stall_budget: StallBudget::new(config.stall_budget, Instant::now()),
             next_stall_check: None,
             producer: OutputProducer::new(scene_on_device, device),
@@ -58,16 +56,10 @@ impl OutputDelivery {
         self.subscribers.push(subscriber);
     }
 
-    /// Adds a request. Answers it with `Busy` when too many requests wait.
+    /// Adds a request. The permits of the callers bound the number of requests.
     pub(super) fn add_request(&mut self, request: StepRequest) {
         self.requests.retain(|request| !request.reply.is_closed());
-        let limit = self.max_pending_requests;
-        if self.requests.len() < limit {
-            self.requests.push(request);
-        } else {
-            let queue_full = Error::Busy { queue: "requests that wait for a step", limit };
-            request.reply.send(Err(queue_full)).ok(); // Fails only if the caller no longer waits.
-        }
+        self.requests.push(request);
     }
 
     /// Begins a full stall budget for a new writer.
