@@ -273,10 +273,8 @@ pub struct Config {
     /// Limit in bytes on the render targets of all frames that are drawn. `None`: a quarter of the memory of the GPU or,
     /// without one, of the host.
     pub render_target_bytes: Option<u64>,
-    /// Limit on open scenes.
+    /// Limit on open scenes, which clients share; see `modalcast::admission`.
     pub open_scenes: usize,
-    /// Limit on open scenes of one client: those with the same lease token or, without one, of one connection.
-    pub client_scenes: usize,
     /// Default window of a step stream: the maximum number of steps without acknowledgment.
     pub window: u32,
     /// Largest window that a client may request.
@@ -362,7 +360,6 @@ impl Default for Config {
             scene_device_bytes: None,
             render_target_bytes: None,
             open_scenes: 16,
-            client_scenes: 12,
             window: 8,
             max_window: 256,
             stream_window: 2 << 20,
@@ -470,7 +467,6 @@ impl Config {
         check_range("window", self.window.into(), 1, self.max_window.into())?;
         check_range("stream_window", self.stream_window.into(), 64 << 10, 4 << 20)?;
         check_range("upload_bytes", self.upload_bytes, 1, 1 << 40)?;
-        check_range("client_scenes", self.client_scenes as u64, 1, 4096)?;
         check_range("client_upload_bytes", self.client_upload_bytes, 1, 1 << 50)?;
         check_range("stored_bytes", self.stored_bytes, 1, 1 << 50)?;
         check_range("upload_files", self.upload_files.into(), 1, 1 << 20)?;

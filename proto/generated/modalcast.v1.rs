@@ -1051,9 +1051,8 @@ pub mod scene_service_client {
     use tonic::codegen::http::Uri;
     /// Opens, uploads, lists, closes and describes scenes.
     ///
-    /// A new scene and its files count to a client (Limits.client_scenes, Limits.client_upload_bytes): to the lease token of 16
-    /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
-    /// connection.
+    /// A new scene and its files count to a client of the principal (Limits.client_scenes, Limits.client_upload_bytes): to the
+    /// session of the viewer, to the process at the other end of a Unix socket, or else to the connection.
     ///
     /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
     /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
@@ -1530,9 +1529,8 @@ pub mod scene_service_server {
     }
     /// Opens, uploads, lists, closes and describes scenes.
     ///
-    /// A new scene and its files count to a client (Limits.client_scenes, Limits.client_upload_bytes): to the lease token of 16
-    /// to 64 bytes (OpenDrive.lease_token) in the metadata key "modalcast-lease-token-bin" of the call or, without one, to the
-    /// connection.
+    /// A new scene and its files count to a client of the principal (Limits.client_scenes, Limits.client_upload_bytes): to the
+    /// session of the viewer, to the process at the other end of a Unix socket, or else to the connection.
     ///
     /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
     /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
@@ -5913,8 +5911,8 @@ pub struct Limits {
     /// per pixel, depending on its samples and on transparency.
     #[prost(uint64, tag = "14")]
     pub render_target_bytes: u64,
-    /// Number of scenes that one client may have open at a time, beside the first of each built-in scene, which has a place
-    /// of its own. SceneService tells what a client is.
+    /// Number of scenes that a single client may have open at a time; the rest is for other clients. The first of each
+    /// built-in scene does not count. SceneService tells what a client is.
     #[prost(uint32, tag = "15")]
     pub client_scenes: u32,
     /// Limit in bytes on the uploads of one client: their declared size while they are in progress, and then the size of

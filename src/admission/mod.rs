@@ -2,7 +2,7 @@
 //! [`PermitPool`] of its resource; [`LIMITS`] lists the resources with their limits.
 //!
 //! Permits are shared max-min: between principals first, then between the clients of a principal. While permits are free,
-//! everybody gets one, but a single client leaves an eighth for others. When none is free, a client that holds fewer than
+//! everybody gets one, but a single client leaves a part for others. When none is free, a client that holds fewer than
 //! another one gets a permit: the one with the least progress of the client that holds the most is preempted, which ends
 //! what it was granted for. Without a preemptible permit, or for a client that already has its share, it is refused.
 

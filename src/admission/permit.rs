@@ -59,7 +59,7 @@ pub struct PermitHandle {
 impl AdmissionMetrics {
     /// A pool of `total` permits that is counted here.
     pub fn pool(&self, limit: &'static Limit, total: usize) -> PermitPool {
-        let share = Share { total, when_full: limit.when_full };
+        let share = Share { total, reserve: total / limit.reserve_divisor, when_full: limit.when_full };
         let (metrics, state) = (self.of_resource(limit.resource), Mutex::default());
         PermitPool(Arc::new(Shared { limit, share, metrics, state, released: Notify::new() }))
     }
@@ -75,15 +75,39 @@ impl PermitPool {
         match state.holders.decide(account, self.0.share) {
             Decision::Grant => {}
             Decision::Preempt(victim) => self.0.preempt(&mut state, &victim),
-            Decision::Refuse => {
-                self.0.metrics.refused.inc();
-                let Limit { objects, .. } = *self.0.limit;
-                return Err(Error::LimitReached { objects, limit: self.0.share.total });
-            }
+            Decision::Refuse => return Err(self.0.refuse()),
         }
+        Ok(self.grant(&mut state, account))
+    }
+
+    /// Grants a permit if one is free, whoever holds the others.
+    ///
+    /// # Errors
+    /// `LimitReached` when no permit is free.
+    pub fn acquire_any(&self, account: &Account) -> Result<Permit> {
+        let mut state = lock(&self.0.state);
+        match state.holders.count() < self.0.share.total {
+            true => Ok(self.grant(&mut state, account)),
+            false => Err(self.0.refuse()),
+        }
+    }
+
+    /// Checks whether [`Self::acquire`] would grant a permit now.
+    ///
+    /// # Errors
+    /// `LimitReached`.
+    pub fn check(&self, account: &Account) -> Result<()> {
+        let state = lock(&self.0.state);
+        match state.holders.decide(account, self.0.share) {
+            Decision::Grant | Decision::Preempt(_) => Ok(()),
+            Decision::Refuse => Err(self.0.refuse()),
+        }
+    }
+
+    fn grant(&self, state: &mut State, account: &Account) -> Permit {
         let grant = Grant::new(account);
         state.holders.insert(account, Arc::clone(&grant));
-        Ok(Permit(PermitHandle { pool: Arc::clone(&self.0), grant }))
+        Permit(PermitHandle { pool: Arc::clone(&self.0), grant })
     }
 
     /// Preempts the permit that is next in order.
@@ -116,6 +140,12 @@ impl PermitPool {
 }
 
 impl Shared {
+    /// Counts a refusal and returns its error.
+    fn refuse(&self) -> Error {
+        self.metrics.refused.inc();
+        Error::LimitReached { objects: self.limit.objects, limit: self.share.total }
+    }
+
     fn preempt(&self, state: &mut State, victim: &Arc<Grant>) {
         let account = lock(&victim.account).clone();
         let held = state.holders.held_by(&account);

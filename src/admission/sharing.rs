@@ -12,6 +12,8 @@ use super::limits::WhenFull;
 pub(super) struct Share {
     /// Number of permits.
     pub(super) total: usize,
+    /// Number of permits that a single client leaves for others.
+    pub(super) reserve: usize,
     pub(super) when_full: WhenFull,
 }
 
@@ -36,13 +38,6 @@ pub(super) struct Holders {
 struct PrincipalHolders {
     clients: BTreeMap<Client, Vec<Arc<Grant>>>,
     count: usize,
-}
-
-impl Share {
-    /// Number of permits that a single client leaves for others.
-    pub(super) const fn reserve(&self) -> usize {
-        self.total / 8
-    }
 }
 
 /// Whether a holder of `own` permits may take one of a holder of `other`: it then has at most as many, or has none and
@@ -87,14 +82,23 @@ impl Holders {
 
     /// Answers a client that asks for a permit.
     pub(super) fn decide(&self, account: &Account, share: Share) -> Decision {
-        if self.held_by(account) + share.reserve() >= share.total {
+        if self.held_by(account) + share.reserve >= share.total {
             return Decision::Refuse;
         }
-        if self.count < share.total {
-            return Decision::Grant;
-        }
+        let free = share.total.saturating_sub(self.count);
         match share.when_full {
+            WhenFull::Preempt if free > 0 => Decision::Grant,
             WhenFull::Preempt => self.find_for(account, share).map_or(Decision::Refuse, Decision::Preempt),
+            WhenFull::Refuse { minimum } => {
+                let of_principal = self.principals.get(&account.principal).map_or(0, |principal| principal.count);
+                let is_free_for_all = free > share.reserve;
+                let is_for_new_client = free > minimum.min(share.reserve) && self.held_by(account) == 0;
+                let is_for_principal = free > 0 && of_principal < minimum;
+                match is_free_for_all || is_for_new_client || is_for_principal {
+                    true => Decision::Grant,
+                    false => Decision::Refuse,
+                }
+            }
         }
     }
 
@@ -129,7 +133,7 @@ impl Holders {
 
 /// Whether anonymous clients hold more than the reserve.
 fn is_crowded(name: &Option<Arc<str>>, principal: &PrincipalHolders, share: Share) -> bool {
-    name.is_none() && principal.count > share.reserve()
+    name.is_none() && principal.count > share.reserve
 }
 
 impl PrincipalHolders {
@@ -145,7 +149,7 @@ impl PrincipalHolders {
         let largest = self.largest_client();
         let candidates = || self.clients.values().filter(|grants| grants.len() == largest).flatten();
         let new = candidates().filter(|grant| grant.last_progress().is_none()).count();
-        let is_crowded = new > share.reserve();
+        let is_crowded = new > share.reserve;
         let rank = |grant: &&Arc<Grant>| match grant.last_progress() {
             Some(time) => (is_crowded, time),
             None => (!is_crowded, grant.granted_at()),

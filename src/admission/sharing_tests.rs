@@ -211,3 +211,30 @@ async fn preempted_holder_learns_what_it_held() {
     let error = tokio::time::timeout(crate::hang_guard::HANG_GUARD, ended).await.expect("expected an end");
     assert_eq!(error, Error::Preempted { objects: "connections", held: 2, limit: 2 });
 }
+
+#[test]
+fn scenes_are_left_for_new_clients_and_other_principals() {
+    let pool = AdmissionMetrics::default().pool(Limit::OPEN_SCENES, 16);
+    let is_granted = |permits: &mut Vec<Permit>, account: Account| match pool.acquire(&account) {
+        Ok(permit) => {
+            assert!(pool.held() <= 16);
+            permits.push(permit);
+            true
+        }
+        Err(error) => {
+            assert_eq!(error, Error::LimitReached { objects: "open scenes", limit: 16 });
+            false
+        }
+    };
+    let mut permits = Vec::new();
+    let count = |permits: &mut Vec<Permit>, principal, client| {
+        (0..20).filter(|_| is_granted(permits, account(principal, client))).count()
+    };
+    assert_eq!(count(&mut permits, "ben", 1), 12, "expected a single client to leave a quarter");
+    assert_eq!([2, 3, 4, 5].map(|client| count(&mut permits, "ben", client)), [1, 1, 1, 0]);
+    assert_eq!(count(&mut permits, "anna", 6), 1, "expected a scene for another principal");
+    assert_eq!(count(&mut permits, "carla", 7), 0);
+    assert!(!permits.iter().any(is_preempted), "expected that no scene ends for another client");
+    permits.clear();
+    assert_eq!(count(&mut permits, "ben", 1), 12);
+}

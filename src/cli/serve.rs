@@ -150,9 +150,6 @@ pub(super) struct Args {
     /// Limit on open scenes.
     #[arg(long, default_value_t = Config::default().open_scenes)]
     open_scenes: usize,
-    /// Limit on open scenes of one client.
-    #[arg(long, default_value_t = Config::default().client_scenes)]
-    client_scenes: usize,
     /// Default window of a step stream: how many steps may be unacknowledged.
     #[arg(long, default_value_t = Config::default().window)]
     window: u32,
@@ -234,7 +231,6 @@ impl Args {
             scene_device_bytes: self.scene_device_bytes,
             render_target_bytes: self.render_target_bytes,
             open_scenes: self.open_scenes,
-            client_scenes: self.client_scenes,
             window: self.window,
             // The default window must not exceed the largest window that a client may request.
             max_window: defaults.max_window.max(self.window),

@@ -17,6 +17,7 @@ use super::physics::PhysicsProcess;
 use super::serve::{TerminationSignals, announce, print_addresses, start};
 use super::tls_options::TlsOptions;
 use super::{Completion, Outcome, print_line, recording};
+use crate::admission::Client;
 use crate::config::{
     BackendChoice, Config, ListenAddress, RendererChoice, ValidatedConfig, ViewerRecording, default_local_sockets,
 };
@@ -208,7 +209,7 @@ async fn view(
     let mut signals = TerminationSignals::install()?;
     let open = async {
         let (engine, listener) = start(config).await?;
-        let scene = engine.open(&location.source, "", &Principal::owner(), None).await?;
+        let scene = engine.open(&location.source, "", &Principal::owner(), Client::Server).await?;
         Ok((engine, listener, scene.name.clone(), location.force_files(&scene.scene)))
     };
     let (engine, listener, scene, force_files) = tokio::select! {

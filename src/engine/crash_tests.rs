@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
 use super::*;
+use crate::admission::Client;
 use crate::hang_guard::HANG_GUARD;
 use modalcast_model::scene::RawStepUpdate;
 
@@ -51,7 +52,8 @@ fn server_with_fault() {
     let loss = runtime.block_on(async {
         let engine = start_engine(state.as_ref()).await;
         for (name, q) in [("control", 0.25), ("faulty", q)] {
-            let scene = engine.open("strips", name, &Principal::owner(), None).await.expect("expected an open scene");
+            let scene =
+                engine.open("strips", name, &Principal::owner(), Client::Server).await.expect("expected an open scene");
             tokio::spawn(send_steps(scene, q));
         }
         tokio::time::timeout(HANG_GUARD, engine.device_lost()).await
@@ -104,7 +106,7 @@ async fn check_set_aside(fault: InjectedFault, cause: &str) {
         engine.shutdown().await;
     }
     let engine = start_engine(folder.path()).await;
-    engine.open("", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
+    engine.open("", "faulty", &Principal::owner(), Client::Server).await.expect("expected an open scene");
     assert_eq!(list(&engine), both_open(), "{fault:?}: expected the opened scene");
     engine.shutdown().await;
     let engine = start_engine(folder.path()).await;
@@ -160,7 +162,7 @@ async fn damaged_crash_log_is_ignored() {
     for damage in [&b"\xff\xfe"[..], b"modalcast crashes 2\n", b"modalcast crashes 1\ncrash SIGABRT faulty\n"] {
         std::fs::write(folder.path().join("crashes"), damage).expect("expected a written file");
         let engine = start_engine(folder.path()).await;
-        engine.open("strips", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
+        engine.open("strips", "faulty", &Principal::owner(), Client::Server).await.expect("expected an open scene");
         engine.shutdown().await;
     }
     // The server records crashes again.

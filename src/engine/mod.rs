@@ -77,7 +77,6 @@ pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, 
 pub use storage::provenance::{SceneProvenance, validate_scene_name};
 pub use storage::scene_record::{EVERYONE, SceneAccess, SceneRight};
 pub use storage::upload::{Upload, UploadHeader};
-pub use upload_quota::ClientId;
 
 #[cfg(test)]
 pub(crate) use testing::lossless_lease;
@@ -106,7 +105,7 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_quota::{UploadPermit, UploadQuota};
-use crate::admission::AdmissionMetrics;
+use crate::admission::{Account, AdmissionMetrics, Client, Limit};
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
@@ -159,7 +158,7 @@ impl Engine {
     ) -> Result<(Self, modalcast_model::scene::RawStepUpdate)> {
         let open = || DeviceContext::with_deformer(testing::FaultyDeformer::boxed);
         let engine = Self::start_with_device(Arc::new(config), Arc::new(testing::StripsSource), open).await?;
-        engine.open("strips", "strips", &Principal::owner(), None).await?;
+        engine.open("strips", "strips", &Principal::owner(), Client::Server).await?;
         let q = bytes::Bytes::copy_from_slice(bytemuck::cast_slice(&[testing::InjectedFault::DeviceLost.q(), 0.0]));
         let step = modalcast_model::scene::RawStepUpdate { number: 1, q_domains: vec![0], q, ..Default::default() };
         Ok((engine, step))
@@ -191,16 +190,17 @@ impl Engine {
         let owners = WorkOwners::new(Some(Arc::clone(&crash_log)));
         let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(open_device, config.device_work_limit, owners).await?;
+        let admission_metrics = AdmissionMetrics::default();
         let shared = Shared {
             services: SceneServices {
                 device: handle,
                 checkpoints,
                 run_counter,
                 config: Arc::clone(&config),
-                admission_metrics: AdmissionMetrics::default(),
+                admission_metrics: admission_metrics.clone(),
             },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
-            registry: Registry::new(config.open_scenes, config.client_scenes),
+            registry: Registry::new(admission_metrics.pool(Limit::OPEN_SCENES, config.open_scenes)),
             frame_streams: Arc::default(),
             config,
             source,
@@ -276,7 +276,7 @@ impl Engine {
     /// Opens a source of the repository under a name; an empty name means the last path component of the source. If the
     /// name is already open from the same source and the principal may use that scene, returns it. With an empty source,
     /// opens a scene of the catalog again, for example one that has failed or that the crash log sets aside. A new scene
-    /// belongs to `principal` and counts to `client`, if there is one.
+    /// belongs to `principal` and counts to `client`.
     ///
     /// # Errors
     /// `NameTaken` when the name belongs to another source or to a scene that the principal may not use, `LimitReached`
@@ -286,7 +286,7 @@ impl Engine {
         source: &str,
         name: &str,
         principal: &Principal,
-        client: Option<ClientId>,
+        client: Client,
     ) -> Result<Arc<SceneHandle>> {
         let name = if name.is_empty() {
             storage::provenance::default_scene_name(source)?
@@ -299,7 +299,7 @@ impl Engine {
             Some(listed) if is_same_scene(&listed) => listed,
             _ => SceneRecord { provenance, access: SceneAccess::new(principal) },
         };
-        self.open_once(name, record, principal, client).await
+        self.open_once(name, record, principal, Account::new(principal, client)).await
     }
 
     /// The record of a scene in the catalog, which may be one that has failed. `None` if the name is free.
@@ -415,7 +415,7 @@ impl Engine {
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `NameTaken` when the name
     /// is in use; `Busy` when too many uploads are in progress; `LimitReached` when the client has too many uploads, or
     /// too many bytes would be stored; `Fault` of the disk.
-    pub async fn begin_upload(&self, header: UploadHeader, principal: &Principal, client: ClientId) -> Result<Upload> {
+    pub async fn begin_upload(&self, header: UploadHeader, principal: &Principal, client: Client) -> Result<Upload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
         let config = &self.shared.config;
@@ -437,7 +437,7 @@ impl Engine {
         &self,
         header: ArrayUploadHeader,
         principal: &Principal,
-        client: ClientId,
+        client: Client,
     ) -> Result<ArrayUpload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
@@ -462,10 +462,11 @@ impl Engine {
 
     /// Checks that a client of `principal` may upload a scene with this name, and counts the upload until the permit is
     /// dropped.
-    fn permit_upload(&self, scene: &str, principal: &Principal, client: ClientId, bytes: u64) -> Result<UploadPermit> {
+    fn permit_upload(&self, scene: &str, principal: &Principal, client: Client, bytes: u64) -> Result<UploadPermit> {
+        let account = Account::new(principal, client);
         self.check_replacement(scene, principal)?;
-        self.shared.registry.check_upload(scene, principal, &client)?;
-        self.shared.upload_quota.admit(client, bytes)
+        self.shared.registry.check_upload(scene, principal, &account)?;
+        self.shared.upload_quota.admit(account, bytes)
     }
 
     /// For each hash, whether a file of a principal's uploads has this content.
@@ -581,7 +582,6 @@ mod tests {
 
     use super::testing::{FaultyDeformer, InjectedFault, StripsSource};
     use super::*;
-    use crate::admission::Account;
     use crate::hang_guard::HANG_GUARD;
 
     const POSITIONS: OutputSpec =
@@ -597,9 +597,11 @@ mod tests {
             .await
             .expect("expected a running engine");
         let faulty_scene =
-            engine.open("strips", "faulty", &Principal::owner(), None).await.expect("expected an open scene");
-        let control_scene =
-            engine.open("strips", "control", &Principal::owner(), None).await.expect("expected an open scene");
+            engine.open("strips", "faulty", &Principal::owner(), Client::Server).await.expect("expected an open scene");
+        let control_scene = engine
+            .open("strips", "control", &Principal::owner(), Client::Server)
+            .await
+            .expect("expected an open scene");
         (engine, faulty_scene, control_scene)
     }
 
@@ -664,7 +666,7 @@ mod tests {
         let error = await_within_limit(deformation.wait()).await.expect_err("expected an unloaded scene").to_string();
         assert!(error.contains("not loaded"), "expected 'not loaded', got {error}");
         assert!(is_done(&send_step(&mut control_writer, 2, 0.5).await), "expected the control scene to continue");
-        let reopened_scene = await_within_limit(engine.open("strips", "faulty", &Principal::owner(), None))
+        let reopened_scene = await_within_limit(engine.open("strips", "faulty", &Principal::owner(), Client::Server))
             .await
             .expect("expected to reopen the scene");
         let restored_step = reopened_scene.last_step().map(|step| step.number);
@@ -678,10 +680,9 @@ mod tests {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let (engine, _, _) = start_faulty_engine(folder.path()).await;
         let opening_engine = engine.clone();
-        let opening =
-            tokio::spawn(
-                async move { opening_engine.open("strips", "late", &Principal::owner(), None).await.map(drop) },
-            );
+        let opening = tokio::spawn(async move {
+            opening_engine.open("strips", "late", &Principal::owner(), Client::Server).await.map(drop)
+        });
         let is_listed = |names: &[&str]| names.contains(&"late");
         await_within_limit(async {
             let mut was_listed = false;
@@ -741,7 +742,7 @@ mod tests {
         };
         for is_canceled in [true, false] {
             let header = UploadHeader { scene: "upload".into(), entry: String::new(), files: 1, total_bytes: 0 };
-            let upload = engine.begin_upload(header, &Principal::owner(), ClientId::Connection(1)).await;
+            let upload = engine.begin_upload(header, &Principal::owner(), Client::Server).await;
             let mut upload = upload.expect("expected an accepted upload");
             upload.begin_file("a.obj", 0, &sha2::Sha256::digest(b"")).expect("expected an accepted file");
             let opening_engine = engine.clone();
@@ -777,7 +778,7 @@ mod tests {
         let panic = await_within_limit(writer.next_report()).await.expect_err("expected the panic");
         let provenance = SceneProvenance::Repository { source: "strips".into() };
         let record = SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) };
-        let request = engine.open_request("late", &record, None);
+        let request = engine.open_request("late", &record, Account::server());
         let entry = engine.shared.registry.reserve(&request, &Principal::owner(), true).expect("expected a place");
         let opened = entry.get_or_open(async || Ok(Arc::clone(&faulty_scene))).await;
         assert_eq!(opened.expect_err("expected the error of the scene"), panic);
@@ -785,7 +786,7 @@ mod tests {
         let list = engine.list(&Principal::owner());
         let is_late = |failed: &FailedScene| failed.name == "late" && failed.error == panic;
         assert!(list.failed.iter().any(is_late) && list.opening.is_empty(), "{:?}", list.failed);
-        await_within_limit(engine.open("strips", "late", &Principal::owner(), None))
+        await_within_limit(engine.open("strips", "late", &Principal::owner(), Client::Server))
             .await
             .expect("expected that the name is free");
         engine.shutdown().await;
@@ -844,7 +845,7 @@ mod tests {
         assert_eq!(await_within_limit(engine.device_lost()).await, loss);
         assert_eq!(engine.find("control").expect_err("expected the loss"), loss);
         assert_eq!(
-            await_within_limit(engine.open("strips", "new", &Principal::owner(), None))
+            await_within_limit(engine.open("strips", "new", &Principal::owner(), Client::Server))
                 .await
                 .expect_err("expected the loss"),
             loss

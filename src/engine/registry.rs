@@ -9,7 +9,7 @@ use tokio::sync::{OnceCell, watch};
 
 use super::lock::lock;
 use super::scene_not_open;
-use super::upload_quota::ClientId;
+use crate::admission::{Account, Permit, PermitPool};
 use crate::engine::device::command::SceneId;
 use crate::engine::scene::handle::SceneHandle;
 use crate::engine::storage::provenance::SceneProvenance;
@@ -22,8 +22,10 @@ use modalcast_model::error::{Error, Result};
 pub(super) struct OpenRequest {
     pub(super) name: String,
     pub(super) record: SceneRecord,
-    /// The client that the scene counts to. `None` for a scene of the last run.
-    pub(super) client: Option<ClientId>,
+    /// What the scene counts to.
+    pub(super) account: Account,
+    /// Whether the scene was open in the last run of the server, and then only needs a free permit.
+    pub(super) is_reopened: bool,
     pub(super) is_built_in: bool,
 }
 
@@ -50,9 +52,8 @@ pub struct FailedScene {
 pub(super) struct RegistryEntry {
     provenance: SceneProvenance,
     access: SharedAccess,
-    client: Option<ClientId>,
-    /// Whether the scene has a place beyond the limit, which each built-in scene has once.
-    has_extra_place: bool,
+    /// `None` for the first scene of each built-in source, which does not count.
+    _permit: Option<Permit>,
     /// Empty until the scene is loaded.
     cell: OnceCell<Arc<SceneHandle>>,
     /// Number of concurrent openings; modified only under the registry's lock.
@@ -96,21 +97,15 @@ impl RegistryEntry {
 
 /// All reserved names.
 pub(super) struct Registry {
-    max_scenes: usize,
-    max_client_scenes: usize,
+    permits: PermitPool,
     entries: Mutex<BTreeMap<String, Arc<RegistryEntry>>>,
     /// By name. At most one per name in the catalog.
     failed: Mutex<BTreeMap<String, FailedScene>>,
 }
 
 impl Registry {
-    pub(super) const fn new(max_scenes: usize, max_client_scenes: usize) -> Self {
-        Self {
-            max_scenes,
-            max_client_scenes,
-            entries: Mutex::new(BTreeMap::new()),
-            failed: Mutex::new(BTreeMap::new()),
-        }
+    pub(super) const fn new(permits: PermitPool) -> Self {
+        Self { permits, entries: Mutex::new(BTreeMap::new()), failed: Mutex::new(BTreeMap::new()) }
     }
 
     /// Reserves a name for a call of `principal` that opens it, or joins an existing reservation with the same provenance
@@ -118,14 +113,16 @@ impl Registry {
     /// built-in source does not count for the limits, so that other scenes cannot lock it out.
     ///
     /// # Errors
-    /// `NameTaken` when the name is reserved for another provenance, `LimitReached` when too many scenes are open.
+    /// `NameTaken` when the name is reserved for another provenance, `LimitReached` when the client has its share of the
+    /// open scenes.
     pub(super) fn reserve(
         &self,
         request: &OpenRequest,
         principal: &Principal,
         must_be_new: bool,
     ) -> Result<Arc<RegistryEntry>> {
-        let OpenRequest { name, record: SceneRecord { provenance, access }, client, is_built_in } = request;
+        let OpenRequest { name, record: SceneRecord { provenance, access }, account, is_reopened, is_built_in } =
+            request;
         let mut entries = self.lock();
         if let Some(entry) = entries.get(name) {
             let may_join = entry.access.borrow().right_of(principal).is_some() && entry.provenance == *provenance;
@@ -137,15 +134,16 @@ impl Registry {
                 false => Err(name_taken_error(name, entry, principal)),
             };
         }
-        let has_extra_place = *is_built_in && !entries.values().any(|entry| entry.provenance == *provenance);
-        if !has_extra_place {
-            self.check_limits(&entries, client.as_ref())?;
-        }
+        let is_extra = *is_built_in && !entries.values().any(|entry| entry.provenance == *provenance);
+        let permit = match (is_extra, is_reopened) {
+            (true, _) => None,
+            (false, true) => Some(self.permits.acquire_any(account)?),
+            (false, false) => Some(self.permits.acquire(account)?),
+        };
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
             access: Arc::new(watch::Sender::new(access.clone())),
-            client: client.clone(),
-            has_extra_place,
+            _permit: permit,
             cell: OnceCell::new(),
             open_calls: AtomicUsize::new(1),
         });
@@ -153,32 +151,14 @@ impl Registry {
         Ok(entry)
     }
 
-    /// Checks that the name is free.
-    ///
-    /// # Errors
-    /// `LimitReached` when the client or all clients have too many scenes.
-    fn check_limits(&self, entries: &BTreeMap<String, Arc<RegistryEntry>>, client: Option<&ClientId>) -> Result<()> {
-        let counted = || entries.values().filter(|entry| !entry.has_extra_place);
-        if counted().count() >= self.max_scenes {
-            return Err(Error::LimitReached { objects: "open scenes", limit: self.max_scenes });
-        }
-        if client.is_some()
-            && counted().filter(|entry| entry.client.as_ref() == client).count() >= self.max_client_scenes
-        {
-            return Err(Error::LimitReached { objects: "open scenes of one client", limit: self.max_client_scenes });
-        }
-        Ok(())
-    }
-
     /// Checks that a client of `principal` can upload a scene with this name.
     ///
     /// # Errors
-    /// `NameTaken` when the name is reserved, `LimitReached` when too many scenes are open.
-    pub(super) fn check_upload(&self, name: &str, principal: &Principal, client: &ClientId) -> Result<()> {
-        let entries = self.lock();
-        match entries.get(name) {
+    /// `NameTaken` when the name is reserved, `LimitReached` when the client has its share of the open scenes.
+    pub(super) fn check_upload(&self, name: &str, principal: &Principal, account: &Account) -> Result<()> {
+        match self.lock().get(name) {
             Some(entry) => Err(name_taken_error(name, entry, principal)),
-            None => self.check_limits(&entries, Some(client)),
+            None => self.permits.check(account),
         }
     }
 
@@ -307,46 +287,56 @@ pub(super) fn hidden_name_error(name: &str) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::admission::{AdmissionMetrics, Client, Limit};
     use crate::identity::Role;
+
+    fn account(client: u64) -> Account {
+        Account::new(&Principal::owner(), Client::Connection(client))
+    }
 
     fn request(name: &str, client: u64, is_built_in: bool) -> OpenRequest {
         let source = if is_built_in { "tree" } else { name }.to_owned();
-        let (provenance, client) = (SceneProvenance::Repository { source }, Some(ClientId::Connection(client)));
+        let provenance = SceneProvenance::Repository { source };
         let record = SceneRecord { provenance, access: SceneAccess::new(&Principal::owner()) };
-        OpenRequest { name: name.to_owned(), record, client, is_built_in }
+        let account = account(client);
+        OpenRequest { name: name.to_owned(), record, account, is_reopened: false, is_built_in }
+    }
+
+    fn registry(max_scenes: usize) -> Registry {
+        Registry::new(AdmissionMetrics::default().pool(Limit::OPEN_SCENES, max_scenes))
     }
 
     #[test]
-    fn clients_have_a_limit_and_the_built_in_scene_has_a_place() {
-        let registry = Registry::new(3, 2);
-        let reserve = |name: &str, client| registry.reserve(&request(name, client, false), &Principal::owner(), false);
-        let limit = |result: Result<Arc<RegistryEntry>>| match result {
-            Err(Error::LimitReached { objects, limit }) => (objects, limit),
-            _ => panic!("expected LimitReached"),
-        };
-        let first = reserve("a", 1).expect("expected a place");
-        reserve("b", 1).expect("expected a place");
-        assert_eq!(limit(reserve("c", 1)), ("open scenes of one client", 2));
-        reserve("c", 2).expect("expected a place of another client");
-        assert_eq!(limit(reserve("d", 2)), ("open scenes", 3));
+    fn clients_share_scenes_and_the_built_in_one_does_not_count() {
+        let registry = registry(4);
+        let open = |request| registry.reserve(&request, &Principal::owner(), false);
+        let reserve = |name: &str, client| open(request(name, client, false));
+        let is_full = |result: Result<Arc<RegistryEntry>>| matches!(result, Err(Error::LimitReached { limit: 4, .. }));
+        let first = reserve("a", 1).expect("expected a free permit");
+        for name in ["b", "c"] {
+            reserve(name, 1).expect("expected a free permit");
+        }
+        assert!(is_full(reserve("d", 1)), "expected a scene for others");
         reserve("a", 2).expect("expected another client to join");
         registry.release("a", &first);
-        registry
-            .reserve(&request("tree", 1, true), &Principal::owner(), false)
-            .expect("expected a place for the built-in scene");
-        let second_tree = registry.reserve(&request("tree 2", 3, true), &Principal::owner(), false);
-        assert_eq!(limit(second_tree), ("open scenes", 3), "expected one extra place for each built-in scene");
+        open(request("tree", 1, true)).expect("expected the built-in scene");
+        assert!(is_full(open(request("tree 2", 1, true))), "expected one uncounted scene of each built-in source");
+        open(OpenRequest { is_reopened: true, ..request("d", 1, false) }).expect("expected a scene of the last run");
+        assert!(is_full(open(OpenRequest { is_reopened: true, ..request("e", 1, false) })));
         assert!(
             matches!(registry.find("tree"), Err(Error::Busy { .. }))
                 && registry.list(&Principal::owner()).opening.contains(&"tree".into())
         );
         registry.release("a", &first);
-        reserve("d", 2).expect("expected the place of the released name");
+        drop(first);
+        let other = Account { principal: Some("anna".into()), ..account(3) };
+        open(OpenRequest { account: other, ..request("e", 3, false) })
+            .expect("expected the permit of the released name");
     }
 
     #[test]
     fn names_of_other_principals_are_taken_without_a_description() {
-        let registry = Registry::new(3, 3);
+        let registry = registry(3);
         let [anna, ben] = ["anna", "ben"].map(|name| Principal { name: name.into(), role: Role::Upload });
         let mut of_anna = request("a", 1, false);
         of_anna.record.access = SceneAccess::new(&anna);
@@ -357,7 +347,7 @@ mod tests {
             _ => panic!("expected NameTaken"),
         };
         assert_eq!(taken(reserve(&ben)), "a scene of another principal");
-        let upload = registry.check_upload("a", &ben, &ClientId::Connection(2));
+        let upload = registry.check_upload("a", &ben, &account(2));
         assert_eq!(
             upload.expect_err("expected an error"),
             Error::NameTaken { name: "a".into(), owner: "a scene of another principal".into() }
@@ -368,7 +358,7 @@ mod tests {
 
     #[test]
     fn failures_are_listed_until_the_scene_is_open_or_deleted() {
-        let registry = Registry::new(3, 3);
+        let registry = registry(3);
         let OpenRequest { record, .. } = request("a", 1, false);
         registry.record_failure("a", &record, Error::ShuttingDown);
         let names = || registry.failed().into_iter().map(|failed| failed.name).collect::<Vec<_>>();

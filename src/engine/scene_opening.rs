@@ -18,8 +18,8 @@ use super::storage::scene_catalog::folder_bytes;
 use super::storage::scene_record::{SceneAccess, SceneRecord, SharedAccess};
 use super::storage::upload::CompleteUpload;
 use super::storage::upload_record::read_hashes;
-use super::upload_quota::ClientId;
 use super::{Engine, scene_not_open};
+use crate::admission::{Account, Client};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, fault_in};
 use modalcast_model::load::{OpenedScene, modes_files};
@@ -39,7 +39,8 @@ impl Engine {
                 self.shared.registry.record_failure(&name, &record, error);
                 continue;
             }
-            let request = self.open_request(&name, &record, None);
+            let account = Account { principal: Some(record.access.owner.as_str().into()), client: Client::Server };
+            let request = OpenRequest { is_reopened: true, ..self.open_request(&name, &record, account) };
             let reserved = self.shared.registry.reserve(&request, &Principal::owner(), false);
             let engine = self.clone();
             openings.spawn(async move { engine.reopen_scene(reserved, &name, &record).await });
@@ -76,9 +77,9 @@ impl Engine {
         }
     }
 
-    pub(super) fn open_request(&self, name: &str, record: &SceneRecord, client: Option<ClientId>) -> OpenRequest {
+    pub(super) fn open_request(&self, name: &str, record: &SceneRecord, account: Account) -> OpenRequest {
         let is_built_in = matches!(&record.provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
-        OpenRequest { name: name.to_owned(), record: record.clone(), client, is_built_in }
+        OpenRequest { name: name.to_owned(), record: record.clone(), account, is_reopened: false, is_built_in }
     }
 
     /// Opens a scene of the repository. Concurrent calls with the same name share one opening. The opening runs in a
@@ -88,12 +89,12 @@ impl Engine {
         name: String,
         record: SceneRecord,
         principal: &Principal,
-        client: Option<ClientId>,
+        account: Account,
     ) -> Result<Arc<SceneHandle>> {
         self.check_running()?;
         let (engine, principal) = (self.clone(), principal.clone());
         let work = async move {
-            let request = engine.open_request(&name, &record, client);
+            let request = engine.open_request(&name, &record, account);
             let entry = engine.shared.registry.reserve(&request, &principal, false)?;
             engine.open_reserved(&entry, name, record.provenance, None).await
         };
@@ -109,10 +110,11 @@ impl Engine {
         // Dropped together with this future.
         let (caller, _waits) = oneshot::channel::<()>();
         let work = async move {
-            let (name, client) = (upload.scene.clone(), upload.client().cloned());
+            let name = upload.scene.clone();
+            let account = upload.account().cloned().unwrap_or_else(|| Account::new(&principal, Client::Server));
             let provenance = SceneProvenance::Upload { entry: upload.entry.clone() };
             let record = SceneRecord { provenance, access: SceneAccess::new(&principal) };
-            let request = engine.open_request(&name, &record, client);
+            let request = engine.open_request(&name, &record, account);
             let entry = engine.shared.registry.reserve(&request, &principal, true)?;
             let opened = engine.open_reserved(&entry, name.clone(), record.provenance, Some(upload)).await;
             if opened.is_ok() && caller.is_closed() {
@@ -263,10 +265,10 @@ impl Engine {
                     // A checkpoint and crashes of an older scene with this name do not apply to the new one.
                     engine.shared.services.checkpoints.remove(&scene_name);
                     engine.shared.crash_log.forget(&scene_name);
-                    let client = upload.client().cloned();
+                    let account = upload.account().cloned();
                     upload.commit(&upload_folder)?;
-                    if let Some(client) = client {
-                        engine.shared.upload_quota.store(&scene_name, client, folder_bytes(&upload_folder));
+                    if let Some(account) = account {
+                        engine.shared.upload_quota.store(&scene_name, account, folder_bytes(&upload_folder));
                     }
                 }
                 let hashes = Arc::new(read_hashes(&upload_folder)?);

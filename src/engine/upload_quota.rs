@@ -3,10 +3,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
-use sha2::{Digest as _, Sha256};
-
-use super::content::ContentHash;
 use super::lock::lock;
+use crate::admission::Account;
 use crate::config::Config;
 use modalcast_model::error::{Error, Result};
 
@@ -15,22 +13,6 @@ const MAX_UPLOADS: usize = 8;
 
 /// Maximum number of uploads in progress of one client, so that others can upload, too.
 const MAX_CLIENT_UPLOADS: usize = 4;
-
-/// The client that a scene or an upload counts to.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum ClientId {
-    /// The hash of the lease token that the client has sent.
-    Token(ContentHash),
-    /// The number of the client's connection.
-    Connection(u64),
-}
-
-impl ClientId {
-    /// The client with this lease token. Its hash does not reveal the token.
-    pub fn of_token(token: &[u8]) -> Self {
-        Self::Token(Sha256::digest(token).into())
-    }
-}
 
 /// The uploads of all clients.
 #[derive(Debug)]
@@ -44,17 +26,17 @@ pub(super) struct UploadQuota {
 struct Uploads {
     next_number: u64,
     /// By number: the client and the declared bytes.
-    in_progress: BTreeMap<u64, (ClientId, u64)>,
+    in_progress: BTreeMap<u64, (Account, u64)>,
     /// By name of the scene: the client, unless the upload is from an earlier run of the server, and the bytes.
-    stored: BTreeMap<String, (Option<ClientId>, u64)>,
+    stored: BTreeMap<String, (Option<Account>, u64)>,
 }
 
 impl Uploads {
     /// Bytes of the uploads of a client, or of all clients.
-    fn bytes(&self, client: Option<&ClientId>) -> u64 {
+    fn bytes(&self, client: Option<&Account>) -> u64 {
         let in_progress = self.in_progress.values().map(|(owner, bytes)| (Some(owner), *bytes));
         let stored = self.stored.values().map(|(owner, bytes)| (owner.as_ref(), *bytes));
-        let counts = |owner: Option<&ClientId>| client.is_none() || owner == client;
+        let counts = |owner: Option<&Account>| client.is_none() || owner == client;
         in_progress
             .chain(stored)
             .filter(|(owner, _)| counts(*owner))
@@ -67,7 +49,7 @@ impl Uploads {
 pub(super) struct UploadPermit {
     quota: Arc<UploadQuota>,
     number: u64,
-    pub(super) client: ClientId,
+    pub(super) account: Account,
 }
 
 impl Drop for UploadPermit {
@@ -89,7 +71,7 @@ impl UploadQuota {
     /// # Errors
     /// `Busy` when too many uploads are in progress; `LimitReached` when the client has too many uploads in progress, or
     /// the bytes of the client or of all clients exceed their limit.
-    pub(super) fn admit(self: &Arc<Self>, client: ClientId, bytes: u64) -> Result<UploadPermit> {
+    pub(super) fn admit(self: &Arc<Self>, client: Account, bytes: u64) -> Result<UploadPermit> {
         let mut uploads = lock(&self.uploads);
         if uploads.in_progress.len() >= MAX_UPLOADS {
             return Err(Error::Busy { queue: "queue of uploads", limit: MAX_UPLOADS });
@@ -109,11 +91,11 @@ impl UploadQuota {
         let number = uploads.next_number;
         uploads.next_number += 1;
         uploads.in_progress.insert(number, (client.clone(), bytes));
-        Ok(UploadPermit { quota: Arc::clone(self), number, client })
+        Ok(UploadPermit { quota: Arc::clone(self), number, account: client })
     }
 
     /// Counts the files of a scene on disk.
-    pub(super) fn store(&self, scene: &str, client: ClientId, bytes: u64) {
+    pub(super) fn store(&self, scene: &str, client: Account, bytes: u64) {
         lock(&self.uploads).stored.insert(scene.to_owned(), (Some(client), bytes));
     }
 
@@ -126,6 +108,11 @@ impl UploadQuota {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::admission::Client;
+
+    fn account(connection: u64) -> Account {
+        Account::anonymous(Client::Connection(connection))
+    }
 
     fn quota(client_upload_bytes: u64, stored_bytes: u64) -> Arc<UploadQuota> {
         let config = Config { client_upload_bytes, stored_bytes, ..Config::default() };
@@ -142,7 +129,7 @@ mod tests {
     #[test]
     fn bytes_count_from_the_header_until_the_scene_is_deleted() {
         let quota = quota(100, 170);
-        let [first, second] = [1, 2].map(ClientId::Connection);
+        let [first, second] = [1, 2].map(account);
         let permit = quota.admit(first.clone(), 60).expect("expected room");
         let client_limit = ("bytes in the uploads of one client", 100);
         assert_eq!(limit_of(quota.admit(first.clone(), 41)), client_limit);
@@ -160,7 +147,7 @@ mod tests {
     #[test]
     fn one_client_cannot_take_all_places() {
         let quota = quota(u64::MAX, u64::MAX);
-        let admit = |client: u64| quota.admit(ClientId::Connection(client), 1);
+        let admit = |client: u64| quota.admit(account(client), 1);
         let permits: Vec<_> = (0..MAX_CLIENT_UPLOADS).map(|_| admit(1).expect("expected a place")).collect();
         assert_eq!(limit_of(admit(1)), ("uploads of one client at a time", MAX_CLIENT_UPLOADS));
         let others: Vec<_> = (0..MAX_CLIENT_UPLOADS).map(|_| admit(2).expect("expected a place")).collect();

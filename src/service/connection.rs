@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tonic::metadata::MetadataMap;
 
 use super::connection_table::ConnectionSlot;
 use super::open_calls::OpenCalls;
@@ -12,9 +11,8 @@ use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 use crate::admission::{Account, Client, PermitHandle};
 use crate::config::Config;
-use crate::engine::{ClientId, LeaseToken};
 use crate::identity::{Credential, Principal, TokenHash};
-use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 
 /// Ratio of the HTTP/2 flow-control windows of a connection and a stream. It is far above the number of streams,
 /// because the window of the connection also limits small frames, see [`MAX_DRIVES`].
@@ -26,9 +24,6 @@ pub(super) const STREAMS_PER_CONNECTION_WINDOW: u32 = 256;
 /// and a step with nothing but its number. One stream is then charged W / 9 * (256 - 9) = 27.4 W, so four are safe. The
 /// parts of a large step are not smaller: a part has a number and says that more follow.
 pub(super) const MAX_DRIVES: usize = 4;
-
-/// Metadata key of the lease token of a client that opens or uploads scenes.
-const LEASE_TOKEN_KEY: &str = "modalcast-lease-token-bin";
 
 /// The budgets that all connections share.
 #[derive(Debug, Clone)]
@@ -51,8 +46,6 @@ impl Budgets {
 /// A connection, in the extensions of each of its calls.
 #[derive(Debug, Clone)]
 pub(super) struct ConnectionInfo {
-    /// Number of the connection; see [`Peer::number`].
-    id: u64,
     /// The client to which the permits of calls count.
     client: Client,
     /// Never sent to another client.
@@ -89,7 +82,6 @@ impl ConnectionInfo {
         slot: &ConnectionSlot,
     ) -> Self {
         Self {
-            id: peer.number,
             client: peer.client(),
             peer: peer.name.as_str().into(),
             credential,
@@ -102,17 +94,6 @@ impl ConnectionInfo {
             calls: Arc::clone(&slot.calls),
             permit: slot.permit().clone(),
         }
-    }
-
-    /// The client to which the scenes and uploads of a call count: the lease token in its metadata or, without one, this
-    /// connection.
-    ///
-    /// # Errors
-    /// `Invalid` for a token of a wrong length.
-    pub(super) fn client(&self, metadata: &MetadataMap) -> Result<ClientId> {
-        let Some(value) = metadata.get_bin(LEASE_TOKEN_KEY) else { return Ok(ClientId::Connection(self.id)) };
-        let bytes = value.to_bytes().map_err(|_| invalid(LEASE_TOKEN_KEY, "a binary value", "another value"))?;
-        LeaseToken::parse(LEASE_TOKEN_KEY, &bytes).map(|token| ClientId::of_token(token.as_bytes()))
     }
 
     /// Gives later calls the credential of a viewer's session. They count to this session.

@@ -10,6 +10,7 @@ use super::authentication::Authenticator;
 use super::caller::Caller;
 use super::connection::MAX_DRIVES;
 use super::status::to_status;
+use crate::admission::Limit;
 use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
 use crate::identity::{Credential, Principal, Role};
@@ -42,7 +43,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             window: config.max_window,
             upload_bytes: config.upload_bytes,
             deadline_ms: to_ms(config.deadline),
-            client_scenes: config.client_scenes as u32,
+            client_scenes: (config.open_scenes - config.open_scenes / Limit::OPEN_SCENES.reserve_divisor) as u32,
             client_upload_bytes: config.client_upload_bytes,
             drives: MAX_DRIVES as u32,
             connection_receive_bytes: config.connection_receive_bytes as u64,

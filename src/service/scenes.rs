@@ -6,7 +6,6 @@ use modalcast_proto::v1;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::caller::Caller;
-use super::connection::ConnectionInfo;
 use super::convert::{ByteBudget, parse_hashes, wire_failed_scene, wire_scene_info, wire_scene_summary};
 use super::describe;
 use super::status::to_status;
@@ -34,11 +33,10 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<v1::OpenSceneRequest>,
     ) -> Result<Response<v1::OpenSceneResponse>, Status> {
         let caller = Caller::of(&request)?;
-        let connection = ConnectionInfo::of(&request).map_err(to_status)?;
-        let client = connection.client(request.metadata()).map_err(to_status)?;
         let v1::OpenSceneRequest { source, scene } = request.into_inner();
         let (engine, principal, name) = (self.0.clone(), Arc::clone(&caller.principal), scene.clone());
-        let opened = catch_panic(async move { engine.open(&source, &name, &principal, Some(client)).await }).await;
+        let client = caller.account.client;
+        let opened = catch_panic(async move { engine.open(&source, &name, &principal, client).await }).await;
         let name = opened.as_ref().map_or(scene, |scene_handle| scene_handle.name.clone());
         let scene_handle = caller.log_change("OpenScene", &name, opened)?;
         respond_once(caller.replies, MAX_INFO_BYTES, async move {
@@ -52,7 +50,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<Streaming<v1::UploadSceneRequest>>,
     ) -> Result<Response<v1::UploadSceneResponse>, Status> {
         let caller = Caller::of(&request)?;
-        let upload: Upload = receive_upload(&self.0, &caller.principal, request).await?;
+        let upload: Upload = receive_upload(&self.0, &caller, request).await?;
         let name = upload.scene().to_owned();
         let (engine, principal) = (self.0.clone(), Arc::clone(&caller.principal));
         let opened = catch_panic(async move { engine.finish_upload(upload, &principal).await }).await;
@@ -68,7 +66,7 @@ impl v1::scene_service_server::SceneService for SceneServiceImpl {
         request: Request<Streaming<v1::UploadArraysRequest>>,
     ) -> Result<Response<v1::UploadArraysResponse>, Status> {
         let caller = Caller::of(&request)?;
-        let upload: ArrayUpload = receive_upload(&self.0, &caller.principal, request).await?;
+        let upload: ArrayUpload = receive_upload(&self.0, &caller, request).await?;
         let name = upload.scene().to_owned();
         let (engine, principal) = (self.0.clone(), Arc::clone(&caller.principal));
         let opened = catch_panic(async move { engine.finish_array_upload(upload, &principal).await }).await;

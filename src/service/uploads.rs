@@ -1,6 +1,5 @@
 //! Receives the streams of `UploadScene` and `UploadArrays`. Both begin with a header and share one time budget.
 
-use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use modalcast_proto::v1;
@@ -8,23 +7,14 @@ use modalcast_proto::v1::upload_arrays_request::Part as ArraysPart;
 use modalcast_proto::v1::upload_scene_request::Part as FilesPart;
 use tonic::{Request, Status, Streaming};
 
-use super::connection::ConnectionInfo;
+use super::caller::Caller;
 use super::convert::{parse_array_upload_header, parse_upload_header, parse_uploaded_domain};
 use super::status::{to_status, transport_status};
-use crate::engine::{ArrayUpload, ClientId, Engine, Upload};
-use crate::identity::Principal;
+use crate::engine::{ArrayUpload, Engine, Upload};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
 const MIN_UPLOAD_RATE: f64 = 32768.0;
-
-/// Who uploads.
-pub(super) struct Uploader {
-    /// The scene belongs to this principal.
-    principal: Arc<Principal>,
-    /// The bytes of the upload count to this client.
-    client: ClientId,
-}
 
 /// An upload whose parts arrive in a stream.
 pub(super) trait StreamedUpload: Sized + Send + 'static {
@@ -35,7 +25,7 @@ pub(super) trait StreamedUpload: Sized + Send + 'static {
     fn part_of(request: Self::Request) -> Option<Self::Part>;
 
     /// Begins an upload with its first part, which must be a header.
-    fn begin(engine: &Engine, uploader: &Uploader, part: Self::Part) -> impl Future<Output = Result<Self>> + Send;
+    fn begin(engine: &Engine, caller: &Caller, part: Self::Part) -> impl Future<Output = Result<Self>> + Send;
 
     /// Adds a later part. Blocks on the disk.
     fn add_part(&mut self, part: Self::Part) -> Result<()>;
@@ -60,12 +50,10 @@ impl StreamedUpload for Upload {
         request.part
     }
 
-    async fn begin(engine: &Engine, uploader: &Uploader, part: FilesPart) -> Result<Self> {
-        let Uploader { principal, client } = uploader;
+    async fn begin(engine: &Engine, caller: &Caller, part: FilesPart) -> Result<Self> {
+        let (principal, client) = (&caller.principal, caller.account.client);
         match part {
-            FilesPart::Header(header) => {
-                engine.begin_upload(parse_upload_header(header), principal, client.clone()).await
-            }
+            FilesPart::Header(header) => engine.begin_upload(parse_upload_header(header), principal, client).await,
             _ => Err(missing_header()),
         }
     }
@@ -92,11 +80,11 @@ impl StreamedUpload for ArrayUpload {
         request.part
     }
 
-    async fn begin(engine: &Engine, uploader: &Uploader, part: ArraysPart) -> Result<Self> {
-        let Uploader { principal, client } = uploader;
+    async fn begin(engine: &Engine, caller: &Caller, part: ArraysPart) -> Result<Self> {
+        let (principal, client) = (&caller.principal, caller.account.client);
         match part {
             ArraysPart::Header(header) => {
-                engine.begin_array_upload(parse_array_upload_header(header)?, principal, client.clone()).await
+                engine.begin_array_upload(parse_array_upload_header(header)?, principal, client).await
             }
             _ => Err(missing_header()),
         }
@@ -119,18 +107,15 @@ impl StreamedUpload for ArrayUpload {
     }
 }
 
-/// Receives all parts of an upload of `principal` until the client closes its side. On failure, removes the files of the
+/// Receives all parts of an upload of `caller` until the client closes its side. On failure, removes the files of the
 /// upload.
 pub(super) async fn receive_upload<U: StreamedUpload>(
     engine: &Engine,
-    principal: &Arc<Principal>,
+    caller: &Caller,
     request: Request<Streaming<U::Request>>,
 ) -> Result<U, Status> {
-    let connection = ConnectionInfo::of(&request).map_err(to_status)?;
-    let client = connection.client(request.metadata()).map_err(to_status)?;
-    let uploader = Uploader { principal: Arc::clone(principal), client };
     let mut upload = None;
-    if let Err(error_status) = receive_parts(engine, &uploader, request.into_inner(), &mut upload).await {
+    if let Err(error_status) = receive_parts(engine, caller, request.into_inner(), &mut upload).await {
         if let Some(upload) = upload {
             // If the removal fails, the next start of the server removes the files.
             tokio::task::spawn_blocking(move || U::discard(upload)).await.ok();
@@ -145,7 +130,7 @@ pub(super) async fn receive_upload<U: StreamedUpload>(
 /// Receives the parts of an upload. After an error the caller discards `upload`.
 async fn receive_parts<U: StreamedUpload>(
     engine: &Engine,
-    uploader: &Uploader,
+    caller: &Caller,
     mut parts: Streaming<U::Request>,
     upload: &mut Option<U>,
 ) -> Result<(), Status> {
@@ -158,7 +143,7 @@ async fn receive_parts<U: StreamedUpload>(
         budget.refill(request.encoded_len());
         let part = U::part_of(request)
             .ok_or_else(|| to_status(Error::UnexpectedMessage { expected: "a part", given: "an empty message" }))?;
-        *upload = Some(receive_part(engine, uploader, upload.take(), part).await.map_err(to_status)?);
+        *upload = Some(receive_part(engine, caller, upload.take(), part).await.map_err(to_status)?);
     }
     Ok(())
 }
@@ -166,11 +151,11 @@ async fn receive_parts<U: StreamedUpload>(
 /// Processes one part of an upload. Discards the upload if that fails. Disk access runs on the blocking pool.
 async fn receive_part<U: StreamedUpload>(
     engine: &Engine,
-    uploader: &Uploader,
+    caller: &Caller,
     upload: Option<U>,
     part: U::Part,
 ) -> Result<U> {
-    let Some(mut upload) = upload else { return U::begin(engine, uploader, part).await };
+    let Some(mut upload) = upload else { return U::begin(engine, caller, part).await };
     let process_part = move || match upload.add_part(part) {
         Ok(()) => Ok(upload),
         Err(error) => {

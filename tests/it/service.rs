@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use modalcast::admission::Client;
 use modalcast::engine::{SceneSource, StoredUpload};
 use modalcast::identity::Principal;
 use modalcast_model::error::Result;
@@ -52,7 +53,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     let server = Server::start_from(crate::service_harness::config(folder.path()), source.clone()).await;
     let open = || {
         let engine = server.engine.clone();
-        tokio::spawn(async move { engine.open("strips", "", &Principal::owner(), None).await })
+        tokio::spawn(async move { engine.open("strips", "", &Principal::owner(), Client::Server).await })
     };
     let first_opening = open();
     // The second opening starts while the first one is in the loader. It has 50 ms to arrive before the first one
@@ -69,7 +70,7 @@ async fn opening_after_a_concurrent_failure_is_registered() {
     server.engine.close("strips", &Principal::owner()).await.expect("expected the scene to close");
     server
         .engine
-        .open("other", "strips", &Principal::owner(), None)
+        .open("other", "strips", &Principal::owner(), Client::Server)
         .await
         .expect("expected the name to be free after closing");
 }

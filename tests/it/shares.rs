@@ -1,11 +1,14 @@
-//! Clients share the streams and the waiting requests of a scene: one client leaves some for others, and a client without any gets one in any case.
+//! Clients share the open scenes, and the streams and waiting requests of a scene: one client leaves some for others, and a client without any gets one in any case.
 
+use modalcast::admission::Client;
 use modalcast::config::Config;
+use modalcast::identity::{Principal, Role};
 use modalcast_proto::v1;
 use tokio::task::JoinSet;
 use tonic::transport::Channel;
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt as _;
+use v1::scene_service_client::SceneServiceClient;
 use v1::state_service_client::StateServiceClient;
 use v1::{Delivery, Reason};
 
@@ -112,4 +115,33 @@ async fn waiting_requests_of_a_scene_are_shared_between_clients() {
     let mut reply = states.get_state(request).await.expect("expected a stream").into_inner();
     with_timeout(reply.message()).await.expect("expected no error").expect("expected a state");
     assert!(others.try_join_next().is_none(), "expected the other clients to wait");
+}
+
+/// Scenes do not end for other clients. One client leaves some, and another principal gets one in any case.
+#[tokio::test(flavor = "multi_thread")]
+async fn open_scenes_are_shared_between_clients() {
+    let server = Server::start_with(|config| Config { open_scenes: 8, ..config }).await;
+    let open = async |channel: &Channel, scene: String| {
+        let request = v1::OpenSceneRequest { source: "strips".into(), scene };
+        with_timeout(SceneServiceClient::new(channel.clone()).open_scene(request)).await.map(drop)
+    };
+    let greedy = server.channel().await;
+    for number in 0..6 {
+        open(&greedy, format!("a{number}")).await.expect("expected a scene");
+    }
+    assert_eq!(reason_of(open(&greedy, "a6".into()).await), Reason::LimitReached);
+    open(&server.channel().await, "b".into()).await.expect("expected a scene of a new client");
+    let anna = Principal { name: "anna".into(), role: Role::Drive };
+    assert_eq!(reason_of(open(&server.channel().await, "c".into()).await), Reason::LimitReached);
+    server.engine.open("strips", "d", &anna, Client::Server).await.expect("expected a scene of another principal");
+    for name in ["a0", "b", "d"] {
+        assert!(server.engine.find(name).is_ok(), "expected '{name}' to stay open");
+    }
+    // The scene of a client counts until it is closed.
+    let request = v1::DeleteSceneRequest { scene: "a0".into() };
+    SceneServiceClient::new(greedy.clone()).delete_scene(request).await.expect("expected a closed scene");
+    open(&server.channel().await, "e".into()).await.expect_err("expected the last scene to be left for principals");
+    let request = v1::DeleteSceneRequest { scene: "a1".into() };
+    SceneServiceClient::new(greedy.clone()).delete_scene(request).await.expect("expected a closed scene");
+    open(&server.channel().await, "e".into()).await.expect("expected a scene of a new client");
 }

@@ -1,5 +1,6 @@
 """Item 11: one client cannot take all places for scenes and uploads, and the built-in scene always has one."""
 
+import contextlib
 import tempfile
 import threading
 import time
@@ -13,9 +14,9 @@ from server import Server
 
 ITEM = 11
 
-# Limit on scenes, of all clients and of one.
-SCENES = 4
-CLIENT_SCENES = 2
+# Limit on scenes, and connections of the attacker that open as many as they can.
+SCENES = 16
+ATTACKERS = 2
 
 # Connections of the attacker that begin uploads without an end.
 UPLOADS = 16
@@ -29,19 +30,21 @@ def try_to_open(client, source, name):
     return grpc.StatusCode.OK
 
 
-def attack_scenes(program, client_scenes):
-    """Scenes that one connection opens, whether another client has a place, and whether `tree` opens at the end."""
-    with tempfile.TemporaryDirectory() as folder:
+def attack_scenes(program):
+    """Scenes that the attackers open, whether another client has one, whether one more of an attacker is refused, and
+    whether `tree` opens at the end."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         write_grid(Path(folder) / "grid.obj", 2)
-        flags = ["--open-scenes", str(SCENES), "--client-scenes", str(client_scenes)]
-        with Server(program, *flags, scenes=folder) as server, Client(server) as attacker, Client(server) as client:
-            opened = sum(
-                try_to_open(attacker, "grid.obj", f"a{number}") == grpc.StatusCode.OK for number in range(2 * SCENES)
-            )
-            is_admitted = try_to_open(client, "grid.obj", "b0") == grpc.StatusCode.OK
-            for number in range(SCENES):
-                try_to_open(client, "grid.obj", f"b{number}")
-            return opened, is_admitted, try_to_open(client, "tree", "tree") == grpc.StatusCode.OK
+        server = stack.enter_context(Server(program, "--open-scenes", str(SCENES), scenes=folder))
+        *attackers, client = [stack.enter_context(Client(server)) for _ in range(ATTACKERS + 1)]
+        opened = [
+            try_to_open(attacker, "grid.obj", f"a{index}-{number}")
+            for index, attacker in enumerate(attackers)
+            for number in range(SCENES)
+        ].count(grpc.StatusCode.OK)
+        is_admitted = try_to_open(client, "grid.obj", "b0") == grpc.StatusCode.OK
+        refusal = try_to_open(attackers[0], "grid.obj", "a")
+        return opened, is_admitted, refusal, try_to_open(client, "tree", "tree") == grpc.StatusCode.OK
 
 
 def begin_upload(client, name, stop):
@@ -87,19 +90,18 @@ def attack_uploads(program, connections):
 
 
 def run(program):
-    opened, is_admitted, has_tree = attack_scenes(program, CLIENT_SCENES)
-    control_opened, control_admitted, _ = attack_scenes(program, SCENES)
+    opened, is_admitted, refusal, has_tree = attack_scenes(program)
     is_upload_admitted = attack_uploads(program, 1)
     control_upload_admitted = attack_uploads(program, 4)
     return [
         Result(
             ITEM,
-            f"one connection opens scenes until {SCENES} places are taken",
-            f"at most {CLIENT_SCENES}, another client is admitted, and `tree` opens when all places are taken",
-            f"{opened}, {'admitted' if is_admitted else 'rejected'}, {'opened' if has_tree else 'rejected'}",
-            opened == CLIENT_SCENES and is_admitted and has_tree,
-            f"without a limit of one client: {control_opened}, {'admitted' if control_admitted else 'rejected'}",
-            control_opened == SCENES and not control_admitted,
+            f"{ATTACKERS} connections open as many of {SCENES} scenes as they can",
+            "another client is admitted, and `tree` opens in any case",
+            f"{opened} opened, {'admitted' if is_admitted else 'rejected'}, {'opened' if has_tree else 'rejected'}",
+            is_admitted and has_tree,
+            f"one more scene of an attacker: {refusal.name}",
+            refusal == grpc.StatusCode.RESOURCE_EXHAUSTED,
         ),
         Result(
             ITEM,

@@ -13,8 +13,9 @@ use sha2::{Digest as _, Sha256};
 use super::file_system::{FileSystem, StateFile};
 use super::upload_folder::UploadFolder;
 use super::upload_record::{RECORD_NAME, UploadRecord, UploadedFiles, find_uploaded_files};
+use crate::admission::Account;
 use crate::engine::content::{ContentHash, hex, parse_hash};
-use crate::engine::upload_quota::{ClientId, UploadPermit};
+use crate::engine::upload_quota::UploadPermit;
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
@@ -87,8 +88,8 @@ impl CompleteUpload {
     }
 
     /// The client that has uploaded the files.
-    pub(in crate::engine) fn client(&self) -> Option<&ClientId> {
-        self.folder.client()
+    pub(in crate::engine) fn account(&self) -> Option<&Account> {
+        self.folder.account()
     }
 
     /// Moves the folder to `target_folder`. Replaces the earlier upload in that folder.
@@ -326,7 +327,7 @@ mod tests {
     fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
         let quota = UploadQuota::new(&Config::default(), BTreeMap::new());
-        let permit = quota.admit(ClientId::Connection(1), total_bytes).expect("expected a free permit");
+        let permit = quota.admit(Account::server(), total_bytes).expect("expected a free permit");
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
         Upload::begin(folder, &disk, header, permit, vec![folder.join("known")]).expect("expected a temporary folder")
     }

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::file_system::FileSystem;
-use crate::engine::upload_quota::{ClientId, UploadPermit};
+use crate::admission::Account;
+use crate::engine::upload_quota::UploadPermit;
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// Number of uploads so far. Makes the names of temporary folders unique.
@@ -45,8 +46,8 @@ impl UploadFolder {
     }
 
     /// The client that uploads.
-    pub(super) fn client(&self) -> Option<&ClientId> {
-        self.permit.as_ref().map(|permit| &permit.client)
+    pub(super) fn account(&self) -> Option<&Account> {
+        self.permit.as_ref().map(|permit| &permit.account)
     }
 
     pub(super) fn path(&self) -> &Path {
