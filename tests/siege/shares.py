@@ -1,4 +1,4 @@
-"""Item 18: clients share what a scene can hold, so that one client does not lock out the others."""
+"""Item 19: clients share what a scene can hold, so that one client does not lock out the others."""
 
 import tempfile
 import threading
