@@ -32,7 +32,7 @@ impl CloseReason {
     }
 
     pub(super) fn going_away() -> Self {
-        Self::new(1001, "the server closes connections without calls")
+        Self::new(1001, "the server shuts down, or makes room for another client")
     }
 
     pub(super) fn text_message() -> Self {
