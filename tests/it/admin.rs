@@ -39,8 +39,7 @@ async fn request(folder: &Path, method: &str, path: &str) -> (u16, String, Strin
 async fn samples(folder: &Path) -> Vec<(String, f64)> {
     let (status, head, text) = request(folder, "GET", "/metrics").await;
     assert_eq!(status, 200);
-    assert!(head.contains("content-type: application/openmetrics-text; version=1.0.0; charset=utf-8"), "{head}");
-    assert!(text.ends_with("# EOF\n"), "{text}");
+    assert!(head.contains("content-type: text/plain; version=0.0.4; charset=utf-8"), "{head}");
     let sample = |line: &str| {
         let (name, value) = line.rsplit_once(' ').expect("expected a sample");
         (name.to_owned(), value.parse().expect("expected a number"))
@@ -50,7 +49,6 @@ async fn samples(folder: &Path) -> Vec<(String, f64)> {
     // Every sample follows the type of its metric.
     for (name, _) in &samples {
         let family = name.split('{').next().unwrap_or_default();
-        let family = family.trim_end_matches("_total").trim_end_matches("_info");
         assert!(text.contains(&format!("# TYPE {family} ")), "{name}");
         assert!(name.starts_with("modalcast_"), "{name}");
     }

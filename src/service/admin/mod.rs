@@ -33,7 +33,7 @@ const EXCHANGE_TIMEOUT: Duration = Duration::from_secs(5);
 const MAX_HEAD_BYTES: usize = 16 << 10;
 
 const PLAIN_TEXT: &str = "text/plain; charset=utf-8";
-const OPEN_METRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+const METRICS: &str = "text/plain; version=0.0.4; charset=utf-8";
 
 /// Answers requests for health, readiness and metrics.
 pub(super) struct AdminServer {
@@ -103,7 +103,7 @@ impl AdminServer {
             "/healthz" => (StatusCode::OK, PLAIN_TEXT, "alive\n".into()),
             "/readyz" => self.readiness(),
             "/metrics" => match self.metrics.render() {
-                Ok(text) => (StatusCode::OK, OPEN_METRICS, text),
+                Ok(text) => (StatusCode::OK, METRICS, text),
                 Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, PLAIN_TEXT, format!("{error}\n")),
             },
             _ => (StatusCode::NOT_FOUND, PLAIN_TEXT, "expected the path /healthz, /readyz or /metrics\n".into()),
