@@ -8,7 +8,6 @@ use tonic::{Request, Response, Status};
 use v1::stream_states_response::Part;
 
 use super::caller::Caller;
-use super::connection::ConnectionInfo;
 use super::convert::{
     describe_step_selector, parse_step_selector, parse_stream_delivery, right_to_receive, wire_stages, wire_step_id,
 };

@@ -10,7 +10,6 @@ use v1::get_vertices_response::Part as SinglePart;
 use v1::stream_vertices_response::Part as StreamPart;
 
 use super::caller::Caller;
-use super::connection::ConnectionInfo;
 use super::convert::{
     describe_step_selector, parse_step_selector, parse_stream_delivery, parse_vertex_selection, right_to_receive,
     wire_delivery, wire_sections, wire_stages, wire_step_id,
