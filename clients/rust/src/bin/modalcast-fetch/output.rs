@@ -212,22 +212,45 @@ fn scene_json(scene: &SceneInfo) -> Value {
     })
 }
 
-/// Prints a link to the viewer at each address that browsers may use. From another machine, that is the URL of the server
-/// that the user has named.
+/// Prints a link to the viewer at each of the [`page_urls`].
 pub(crate) fn print_links(server: &str, link: &v1::CreateViewerLinkResponse, scene: Option<&str>) {
     let separator = if link.url_path.contains('#') { '&' } else { '#' };
     let scene = scene.map(|scene| format!("{separator}scene={scene}")).unwrap_or_default();
+    for url in page_urls(server, link) {
+        println!("{url}{}{scene}", link.url_path);
+    }
+}
+
+/// The URLs of the page: all that the server names if it is on this machine; else its public URL or, without one, the
+/// address of this client.
+fn page_urls(server: &str, link: &v1::CreateViewerLinkResponse) -> Vec<String> {
+    let has_scheme = server.contains("://") || server.starts_with("unix:");
+    let server = if has_scheme { server.to_owned() } else { format!("http://{server}") };
     let is_here =
         ["unix:", "http://127.", "http://localhost", "http://[::1]"].iter().any(|start| server.starts_with(start));
-    let named = [server.trim_end_matches('/').to_owned()];
-    for url in if is_here && !link.urls.is_empty() { &link.urls[..] } else { &named } {
-        println!("{url}{}{scene}", link.url_path);
+    match (is_here && !link.urls.is_empty(), link.public_url.is_empty()) {
+        (true, _) => link.urls.clone(),
+        (false, false) => vec![link.public_url.clone()],
+        (false, true) => vec![server.trim_end_matches('/').to_owned()],
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn links_begin_with_urls_that_browsers_reach() {
+        let urls = vec!["https://127.0.0.1:1".to_owned(), "https://gpu:1".to_owned()];
+        let link = v1::CreateViewerLinkResponse { urls: urls.clone(), ..Default::default() };
+        for server in ["127.0.0.1:1", "localhost:1", "http://127.0.0.1:1", "unix:/run/1.sock"] {
+            assert_eq!(page_urls(server, &link), urls, "{server}");
+        }
+        assert_eq!(page_urls("gpu:1", &link), ["http://gpu:1"]);
+        assert_eq!(page_urls("https://gpu:1/", &link), ["https://gpu:1"]);
+        let public = v1::CreateViewerLinkResponse { public_url: "https://lab.example/render".into(), ..link };
+        assert_eq!(page_urls("https://gpu:1", &public), ["https://lab.example/render"]);
+    }
 
     #[test]
     fn rate_excludes_the_wait_for_the_first_reply() {
