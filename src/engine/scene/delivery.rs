@@ -11,7 +11,7 @@ const MAX_INTERVAL: Duration = Duration::from_secs(10 * 365 * 86_400);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Delivery {
     /// Every step, in order. A lossless subscriber that reads slowly makes a lossless writer wait, until it exceeds the
-    /// [stall budget](super::stall_budget). If the writer is `Latest`, such a subscriber skips steps.
+    /// stall budget. If the writer is `Latest`, such a subscriber skips steps.
     Lossless,
     /// A subscriber receives the newest step, starting with the current one if the scene has had a step. Queued steps
     /// of a writer are merged into one whose effect on the state equals applying all of them in order.

@@ -70,7 +70,7 @@ pub struct LeaseRequest {
     pub overflow: Overflow,
     /// Number of steps that may be unacknowledged.
     pub window: u32,
-    /// How long lossless subscribers may make the writer wait; see [`StallBudget`](super::stall_budget::StallBudget).
+    /// The stall budget: how long lossless subscribers may make the writer wait.
     pub stall_budget: Duration,
     /// `None` asks for a new token.
     pub token: Option<LeaseToken>,
