@@ -100,7 +100,7 @@ test("a phone opens the printed link of a server with TLS", { timeout: LIMIT_MS 
     // The name of this machine needs not be known here.
     link.hostname = networkAddress();
     const phone = { isMobile: true, hasTouch: true, deviceScaleFactor: 2 };
-    // Whoever uses a self-signed certificate accepts it in the browser.
+    // Users accept a self-signed certificate in their browser.
     const { page, errors } = await openPage(browser, link.href, 390, 844, { ...phone, ignoreHTTPSErrors: true });
     await openTree(page);
     await takeScreenshot(page, "phone-tls");
