@@ -80,7 +80,7 @@ impl PermitPool {
         Ok(self.grant(&mut state, account))
     }
 
-    /// Grants a permit if one is free, whoever holds the others.
+    /// Grants a permit if one is free, without regard to the shares of the holders.
     ///
     /// # Errors
     /// `LimitReached` when no permit is free.

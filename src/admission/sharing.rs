@@ -116,7 +116,7 @@ impl Holders {
         principal.least_progress(share)
     }
 
-    /// The next permit to preempt, whoever asks.
+    /// The next permit to preempt, for any client.
     pub(super) fn find_any(&self, share: Share) -> Option<Arc<Grant>> {
         self.largest_principal(share)?.1.least_progress(share)
     }

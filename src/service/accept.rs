@@ -95,7 +95,7 @@ impl ConnectionServer {
         }
     }
 
-    /// The account of a connection by what is known before its first bytes.
+    /// The account of a connection before its first bytes.
     fn account_of(&self, peer: &Peer) -> Account {
         let credential = self.authenticator.credential_of_connection(peer.uid, &[]);
         let principal = credential.map(|credential| Arc::clone(credential.principal()));
