@@ -444,7 +444,7 @@ impl Engine {
         self.check_upload_bytes(header.total_bytes)?;
         let permit = self.permit_upload(&header.scene, principal, client, header.total_bytes)?;
         let (upload_folder, file_system) = (self.shared.scene_catalog.uploads(), self.file_system());
-        let memory = self.shared.memory.new_scene().host;
+        let memory = self.shared.memory.new_scene(&principal.name).host;
         run_blocking("upload", move || ArrayUpload::begin(&upload_folder, &file_system, header, permit, memory)).await
     }
 

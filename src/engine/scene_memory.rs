@@ -1,15 +1,20 @@
 //! The memory that an open scene takes, and its reservation.
 
-use std::sync::Arc;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
 
+use crate::engine::lock::lock;
 use crate::engine::memory_limits::MemoryLimits;
 use modalcast_model::domain::Shape;
 use modalcast_model::error::Result;
-use modalcast_model::memory::{MemoryBudget, MemoryReservation};
+use modalcast_model::memory::{MemoryBudget, MemoryGroup, MemoryReservation};
 use modalcast_model::scene::Scene;
 
 /// Bytes of a domain on host and device, without its mesh: names, notes, transforms of several steps, tables.
 const DOMAIN_BYTES: u64 = 2048;
+
+/// The scenes of one principal leave this part of the memory for others: 1 / `RESERVE_DIVISOR`.
+const RESERVE_DIVISOR: u64 = 8;
 
 /// Output sets of a deformer: one is written while another is copied.
 const OUTPUT_SETS: u64 = 2;
@@ -19,8 +24,17 @@ const OUTPUT_SETS: u64 = 2;
 pub(super) struct MemoryBudgets {
     host: Arc<MemoryBudget>,
     device: Arc<MemoryBudget>,
+    /// By the principals to whom the scenes belong.
+    groups: Mutex<BTreeMap<String, PrincipalMemory>>,
     has_device: bool,
     has_renderer: bool,
+}
+
+/// The memory of the scenes of one principal.
+#[derive(Debug, Clone)]
+struct PrincipalMemory {
+    host: Arc<MemoryGroup>,
+    device: Arc<MemoryGroup>,
 }
 
 /// Memory of all scenes in bytes.
@@ -43,7 +57,8 @@ impl MemoryBudgets {
     /// Without a renderer, scenes need no memory to be drawn.
     pub(super) fn new(limits: MemoryLimits, has_renderer: bool) -> Self {
         let has_device = limits.has_device;
-        Self { host: limits.host_budget(), device: limits.device_budget(), has_device, has_renderer }
+        let groups = Mutex::default();
+        Self { host: limits.host_budget(), device: limits.device_budget(), groups, has_device, has_renderer }
     }
 
     /// The memory of all scenes, by its kind. Without a device, what scenes have there counts as host memory.
@@ -52,14 +67,29 @@ impl MemoryBudgets {
         budgets.map(|(kind, budget)| (kind, MemoryUse { reserved: budget.reserved(), limit: budget.total() }))
     }
 
-    /// The memory of a scene that is to be loaded.
-    pub(super) fn new_scene(&self) -> SceneMemory {
+    /// The memory of a scene of a principal that is to be loaded.
+    pub(super) fn new_scene(&self, principal: &str) -> SceneMemory {
+        let PrincipalMemory { host, device } = self.memory_of(principal);
         SceneMemory {
-            host: MemoryReservation::new(&self.host),
-            device: MemoryReservation::new(&self.device),
+            host: MemoryReservation::in_group(&host),
+            device: MemoryReservation::in_group(&device),
             has_device: self.has_device,
             has_renderer: self.has_renderer,
         }
+    }
+
+    fn memory_of(&self, principal: &str) -> PrincipalMemory {
+        let new_group = |budget: &Arc<MemoryBudget>| {
+            let total = budget.total();
+            MemoryGroup::new(budget, total - total / RESERVE_DIVISOR)
+        };
+        let mut groups = lock(&self.groups);
+        // Principals without scenes.
+        groups.retain(|_, memory| Arc::strong_count(&memory.host) > 1 || Arc::strong_count(&memory.device) > 1);
+        let memory = groups.entry(principal.to_owned());
+        memory
+            .or_insert_with(|| PrincipalMemory { host: new_group(&self.host), device: new_group(&self.device) })
+            .clone()
     }
 }
 
@@ -148,9 +178,9 @@ mod tests {
 
     fn budgets(bytes: u64, has_device: bool) -> MemoryBudgets {
         let config = Config {
-            scenes_host_bytes: Some(bytes),
+            scenes_host_bytes: Some(2 * bytes),
             scene_host_bytes: Some(bytes),
-            scenes_device_bytes: Some(bytes),
+            scenes_device_bytes: Some(2 * bytes),
             scene_device_bytes: Some(bytes),
             ..Config::default()
         };
@@ -161,7 +191,7 @@ mod tests {
     fn loaded_scene_replaces_the_reservation_of_its_files() {
         let scene = testing::two_strips();
         let budgets = budgets(1 << 30, true);
-        let memory = budgets.new_scene();
+        let memory = budgets.new_scene("anna");
         memory.host.reserve("file", 1 << 20).expect("expected enough memory");
         memory.reserve_loaded("strips", &scene).expect("expected enough memory");
         let expected = (host_bytes(&scene), device_bytes(&scene));
@@ -170,13 +200,33 @@ mod tests {
         assert_eq!((budgets.host.reserved(), budgets.device.reserved()), (0, 0));
     }
 
+    /// A principal that opens scenes as long as it can leaves memory for others.
+    #[test]
+    fn principals_share_the_memory() {
+        let scene = testing::two_strips();
+        let budgets = budgets(8 * (host_bytes(&scene) + device_bytes(&scene)), false);
+        let open = |principal: &str| {
+            let memory = budgets.new_scene(principal);
+            memory.reserve_loaded("strips", &scene).map(|()| memory)
+        };
+        let mut of_anna: Vec<_> = std::iter::repeat_with(|| open("anna")).map_while(Result::ok).collect();
+        assert_eq!(of_anna.len(), 14, "expected 2 of 16 to be left");
+        let of_ben = [open("ben").expect("expected the rest"), open("ben").expect("expected the rest")];
+        assert!(open("carla").is_err());
+        of_anna.pop();
+        open("carla").expect("expected the memory of the closed scene");
+        drop((of_anna, of_ben));
+        open("ben").expect("expected the memory of the closed scenes");
+        assert_eq!(lock(&budgets.groups).len(), 1, "expected no group without a scene");
+    }
+
     #[test]
     fn scene_without_gpu_counts_its_device_memory_as_host_memory() {
         let scene = testing::two_strips();
         let bytes = host_bytes(&scene) + device_bytes(&scene);
-        let memory = budgets(bytes, false).new_scene();
+        let memory = budgets(bytes, false).new_scene("anna");
         memory.reserve_loaded("strips", &scene).expect("expected exactly enough memory");
-        let error = budgets(bytes - 1, false).new_scene().reserve_loaded("strips", &scene);
+        let error = budgets(bytes - 1, false).new_scene("anna").reserve_loaded("strips", &scene);
         assert!(matches!(error, Err(Error::OutOfMemory { asked, .. }) if asked == bytes), "{error:?}");
     }
 }

@@ -181,7 +181,7 @@ impl Engine {
         access: &SharedAccess,
         upload: Option<CompleteUpload>,
     ) -> Result<SceneHandle> {
-        let memory = self.shared.memory.new_scene();
+        let memory = self.shared.memory.new_scene(&access.borrow().owner);
         let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload, &memory).await?;
         memory.reserve_loaded(name, &scene)?;
         let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));

@@ -24,6 +24,14 @@ impl MemoryKind {
         }
     }
 
+    const fn of_one_group(self) -> &'static str {
+        match self {
+            Self::Host => "host memory of the scenes of one principal",
+            Self::Device => "device memory of the scenes of one principal",
+            Self::RenderTargets => "memory of one group of render targets",
+        }
+    }
+
     const fn of_all_scenes(self) -> &'static str {
         match self {
             Self::Host => "host memory of all scenes",
@@ -66,17 +74,45 @@ impl MemoryBudget {
     }
 }
 
+/// Scenes that may reserve only a part of a budget together: those of one principal.
+#[derive(Debug)]
+pub struct MemoryGroup {
+    budget: Arc<MemoryBudget>,
+    /// In bytes.
+    total: u64,
+    reserved: AtomicU64,
+}
+
+impl MemoryGroup {
+    /// A group that may reserve `total` bytes.
+    pub fn new(budget: &Arc<MemoryBudget>, total: u64) -> Arc<Self> {
+        Arc::new(Self { budget: Arc::clone(budget), total, reserved: AtomicU64::new(0) })
+    }
+}
+
 /// The memory that one scene has reserved. Dropping it returns the memory to the budget.
 #[derive(Debug)]
 pub struct MemoryReservation {
-    budget: Arc<MemoryBudget>,
+    group: Arc<MemoryGroup>,
     bytes: AtomicU64,
 }
 
+/// One of the limits of a reservation.
+struct Level<'a> {
+    memory: &'static str,
+    total: u64,
+    reserved: &'a AtomicU64,
+}
+
 impl MemoryReservation {
-    /// Nothing reserved yet.
+    /// Nothing reserved yet, for a scene that belongs to no group.
     pub fn new(budget: &Arc<MemoryBudget>) -> Arc<Self> {
-        Arc::new(Self { budget: Arc::clone(budget), bytes: AtomicU64::new(0) })
+        Self::in_group(&MemoryGroup::new(budget, budget.total))
+    }
+
+    /// Nothing reserved yet, for a scene of a group.
+    pub fn in_group(group: &Arc<MemoryGroup>) -> Arc<Self> {
+        Arc::new(Self { group: Arc::clone(group), bytes: AtomicU64::new(0) })
     }
 
     /// A reservation without limits, for scenes that the user of this machine opens.
@@ -92,21 +128,32 @@ impl MemoryReservation {
     /// Reserves memory for an object until the scene is closed. `object` names it in the error.
     ///
     /// # Errors
-    /// `OutOfMemory` if the limit of the scene or that of all scenes is exceeded; nothing is then reserved.
+    /// `OutOfMemory` if the limit of the scene, of its group or of all scenes is exceeded; nothing is then reserved.
     pub fn reserve(&self, object: &str, bytes: u64) -> Result<()> {
-        let MemoryBudget { kind, total, per_scene, reserved } = &*self.budget;
-        let exceeded = |memory, total: u64, used: u64| Error::OutOfMemory {
-            object: object.to_owned(),
-            memory,
-            asked: bytes,
-            available: total.saturating_sub(used),
-            total,
-        };
-        add_up_to(&self.bytes, bytes, *per_scene).map_err(|used| exceeded(kind.of_one_scene(), *per_scene, used))?;
-        add_up_to(reserved, bytes, *total).map_err(|used| {
-            self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-            exceeded(kind.of_all_scenes(), *total, used)
-        })
+        let levels = self.levels();
+        for (passed, level) in levels.iter().enumerate() {
+            let Err(used) = add_up_to(level.reserved, bytes, level.total) else { continue };
+            for level in &levels[..passed] {
+                level.reserved.fetch_sub(bytes, Ordering::Relaxed);
+            }
+            return Err(Error::OutOfMemory {
+                object: object.to_owned(),
+                memory: level.memory,
+                asked: bytes,
+                available: level.total.saturating_sub(used),
+                total: level.total,
+            });
+        }
+        Ok(())
+    }
+
+    fn levels(&self) -> [Level<'_>; 3] {
+        let (group, MemoryBudget { kind, total, per_scene, reserved }) = (&*self.group, &*self.group.budget);
+        [
+            Level { memory: kind.of_one_scene(), total: *per_scene, reserved: &self.bytes },
+            Level { memory: kind.of_one_group(), total: group.total, reserved: &group.reserved },
+            Level { memory: kind.of_all_scenes(), total: *total, reserved },
+        ]
     }
 
     /// Reserves memory for an object that is freed when the returned guard is dropped.
@@ -134,8 +181,9 @@ impl MemoryReservation {
     }
 
     fn release(&self, bytes: u64) {
-        self.bytes.fetch_sub(bytes, Ordering::Relaxed);
-        self.budget.reserved.fetch_sub(bytes, Ordering::Relaxed);
+        for level in self.levels() {
+            level.reserved.fetch_sub(bytes, Ordering::Relaxed);
+        }
     }
 }
 
@@ -206,6 +254,22 @@ mod tests {
         second.reserve("c", 40).expect("the limit of all scenes");
         drop(first);
         assert_eq!(budget.reserved(), 40);
+    }
+
+    #[test]
+    fn a_group_leaves_memory_for_others() {
+        let budget = MemoryBudget::new(MemoryKind::Host, 100, 60);
+        let [group, other] = [(); 2].map(|()| MemoryGroup::new(&budget, 80));
+        let [first, second] = [(); 2].map(|()| MemoryReservation::in_group(&group));
+        first.reserve("a", 60).expect("the limit of a scene");
+        assert_eq!(exceeded(second.reserve("b", 21)), ("host memory of the scenes of one principal", 21, 20, 80));
+        assert_eq!((second.bytes(), budget.reserved()), (0, 60), "expected a rejected reservation to take nothing");
+        second.reserve("b", 20).expect("the limit of the group");
+        let of_other = MemoryReservation::in_group(&other);
+        assert_eq!(exceeded(of_other.reserve("c", 21)), ("host memory of all scenes", 21, 20, 100));
+        of_other.reserve("c", 20).expect("the rest");
+        drop((first, second));
+        MemoryReservation::in_group(&group).reserve("d", 60).expect("the memory of the dropped scenes");
     }
 
     #[test]

@@ -39,7 +39,7 @@ impl TestScene {
         let folder = tempfile::tempdir().expect("expected a temporary folder");
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
         let config = Config::default();
-        let memory = MemoryBudgets::new(MemoryLimits::new(&config, None), true).new_scene();
+        let memory = MemoryBudgets::new(MemoryLimits::new(&config, None), true).new_scene("anna");
         let (device, mut commands) = DeviceHandle::mock();
         let services = SceneServices {
             device,
