@@ -284,9 +284,8 @@ pub struct Config {
     pub stream_window: u32,
     /// Limit on the total size of one upload, in bytes.
     pub upload_bytes: u64,
-    /// Limits in bytes on the uploads of one client, and on all uploads. Uploads in progress count with their declared
-    /// size, and open scenes with the size of their files.
-    pub client_upload_bytes: u64,
+    /// Limit in bytes on all uploads, which principals share. Uploads in progress count with their declared size, and open
+    /// scenes with the size of their files.
     pub stored_bytes: u64,
     /// Limit on the number of files of one upload.
     pub upload_files: u32,
@@ -364,7 +363,6 @@ impl Default for Config {
             max_window: 256,
             stream_window: 2 << 20,
             upload_bytes: 4 << 30,
-            client_upload_bytes: 16 << 30,
             stored_bytes: 64 << 30,
             upload_files: 4096,
             deadline: Duration::from_secs(30),
@@ -467,7 +465,6 @@ impl Config {
         check_range("window", self.window.into(), 1, self.max_window.into())?;
         check_range("stream_window", self.stream_window.into(), 64 << 10, 4 << 20)?;
         check_range("upload_bytes", self.upload_bytes, 1, 1 << 40)?;
-        check_range("client_upload_bytes", self.client_upload_bytes, 1, 1 << 50)?;
         check_range("stored_bytes", self.stored_bytes, 1, 1 << 50)?;
         check_range("upload_files", self.upload_files.into(), 1, 1 << 20)?;
         check_range("max_subscribers", self.max_subscribers as u64, 1, 4096)?;

@@ -17,6 +17,8 @@ pub struct Account {
 pub enum Client {
     /// The server itself, and programs that run the engine in their process.
     Server,
+    /// All clients of the principal, for what outlives them.
+    Any,
     /// A session of the viewer, by its token.
     Session(TokenHash),
     /// A process that is connected to a Unix socket, by its id.

@@ -1,6 +1,6 @@
 //! What a pool, a permit and its handles share.
 
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::watch;
@@ -15,6 +15,8 @@ pub(super) struct Grant {
     pub(super) account: Mutex<Account>,
     pub(super) has_principal: AtomicBool,
     granted_at: u64,
+    /// What the permit counts for. Changes only while the pool is locked.
+    amount: AtomicUsize,
     pub(super) progress: Progress,
     /// The error of whatever the permit was granted for, once the permit is preempted.
     pub(super) preemption: watch::Sender<Option<Error>>,
@@ -26,11 +28,12 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Grant {
-    pub(super) fn new(account: &Account) -> Arc<Self> {
+    pub(super) fn new(account: &Account, amount: usize) -> Arc<Self> {
         Arc::new(Self {
             account: Mutex::new(account.clone()),
             has_principal: AtomicBool::new(account.principal.is_some()),
             granted_at: now(),
+            amount: AtomicUsize::new(amount),
             progress: Progress::default(),
             preemption: watch::Sender::new(None),
         })
@@ -42,5 +45,14 @@ impl Grant {
 
     pub(super) const fn granted_at(&self) -> u64 {
         self.granted_at
+    }
+
+    pub(super) fn amount(&self) -> usize {
+        self.amount.load(Ordering::Relaxed)
+    }
+
+    /// Returns the former amount.
+    pub(super) fn set_amount(&self, amount: usize) -> usize {
+        self.amount.swap(amount, Ordering::Relaxed)
     }
 }

@@ -1,18 +1,18 @@
-//! The table of all resources that are limited in number. `deploy/README.md` has the same table.
+//! The table of all resources that are limited in number or in bytes. `deploy/README.md` has the same table.
 
 use crate::config::Config;
 
-/// What happens to a client that asks for a permit when none is free.
+/// What happens to a client that asks for more than is free.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum WhenFull {
     /// The permit with the least progress of the client that holds the most is preempted.
     Preempt,
-    /// The client is refused. Of the permits that one client leaves for others, this number is for principals that hold
-    /// fewer, and the rest for clients without any.
+    /// The client is refused. Of what one client leaves for others, this much is for principals that hold less, and the
+    /// rest for clients that hold nothing.
     Refuse { minimum: usize },
 }
 
-/// A resource that is limited in number.
+/// A resource that is limited in number or in bytes.
 #[derive(Debug)]
 pub struct Limit {
     /// The name in metrics.
@@ -28,6 +28,12 @@ pub struct Limit {
 }
 
 impl Limit {
+    /// What a single client can hold.
+    pub fn of_client(&self, config: &Config) -> usize {
+        let total = (self.total)(config);
+        total - total / self.reserve_divisor
+    }
+
     pub const CONNECTIONS: &'static Self = &Self {
         resource: "connections",
         objects: "connections",
@@ -64,10 +70,36 @@ impl Limit {
         reserve_divisor: 4,
         when_full: WhenFull::Refuse { minimum: 1 },
     };
+
+    pub const UPLOADS: &'static Self = &Self {
+        resource: "uploads",
+        objects: "uploads in progress",
+        option: None,
+        total: |_| 32,
+        reserve_divisor: 8,
+        when_full: WhenFull::Preempt,
+    };
+
+    /// They count to the principal, whichever client it uploads with.
+    pub const STORED_BYTES: &'static Self = &Self {
+        resource: "stored_bytes",
+        objects: "bytes of uploads on disk",
+        option: Some("--stored-bytes"),
+        total: |config| usize::try_from(config.stored_bytes).unwrap_or(usize::MAX),
+        reserve_divisor: 4,
+        when_full: WhenFull::Refuse { minimum: 1 << 30 },
+    };
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 4] = [Limit::CONNECTIONS, Limit::SUBSCRIPTIONS, Limit::WAITING_REQUESTS, Limit::OPEN_SCENES];
+pub const LIMITS: [&Limit; 6] = [
+    Limit::CONNECTIONS,
+    Limit::SUBSCRIPTIONS,
+    Limit::WAITING_REQUESTS,
+    Limit::OPEN_SCENES,
+    Limit::UPLOADS,
+    Limit::STORED_BYTES,
+];
 
 #[cfg(test)]
 mod tests {
@@ -79,12 +111,17 @@ mod tests {
         let page = include_str!("../../deploy/README.md");
         let row = |limit: &&Limit| {
             let total = (limit.total)(&Config::default());
+            let shown = |amount: usize| match (amount >> 30, amount >> 20) {
+                (0, 0) => amount.to_string(),
+                (0, mib) => format!("{mib} MiB"),
+                (gib, _) => format!("{gib} GiB"),
+            };
             let option = limit.option.map_or_else(String::new, |option| format!("`{option}`"));
             let when_full = match limit.when_full {
                 WhenFull::Preempt => "the one with the least progress ends".to_owned(),
-                WhenFull::Refuse { minimum } => format!("refused; {minimum} for a principal without any"),
+                WhenFull::Refuse { minimum } => format!("refused; {} for a principal without any", shown(minimum)),
             };
-            let kept = total / limit.reserve_divisor;
+            let (kept, total) = (shown(total / limit.reserve_divisor), shown(total));
             format!("| {} | `{}` | {option} | {total} | {kept} | {when_full} |", limit.objects, limit.resource)
         };
         let documented = page.lines().skip_while(|line| !line.starts_with("| what a client holds |"));

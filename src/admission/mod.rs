@@ -1,5 +1,5 @@
-//! Admission control of everything that is limited in number, such as connections. A holder needs a [`Permit`] of the
-//! [`PermitPool`] of its resource; [`LIMITS`] lists the resources with their limits.
+//! Admission control of everything that is limited in number or in bytes, such as connections. A holder needs a [`Permit`]
+//! of the [`PermitPool`] of its resource; [`LIMITS`] lists the resources with their limits.
 //!
 //! Permits are shared max-min: between principals first, then between the clients of a principal. While permits are free,
 //! everybody gets one, but a single client leaves a part for others. When none is free, a client that holds fewer than

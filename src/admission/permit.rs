@@ -45,7 +45,7 @@ struct PreemptionLog {
     last_record: Option<Instant>,
 }
 
-/// Counts as one of a resource until it is dropped.
+/// Counts for an amount of a resource until it is dropped.
 #[derive(Debug)]
 pub struct Permit(PermitHandle);
 
@@ -66,30 +66,39 @@ impl AdmissionMetrics {
 }
 
 impl PermitPool {
-    /// Grants a permit, if necessary after the preemption of another one.
+    /// Grants a permit that counts as one, if necessary after the preemption of another one.
     ///
     /// # Errors
     /// `LimitReached` when no permit is free and the client has its share, or the client would take the reserve.
     pub fn acquire(&self, account: &Account) -> Result<Permit> {
-        let mut state = lock(&self.0.state);
-        match state.holders.decide(account, self.0.share) {
-            Decision::Grant => {}
-            Decision::Preempt(victim) => self.0.preempt(&mut state, &victim),
-            Decision::Refuse => return Err(self.0.refuse()),
-        }
-        Ok(self.grant(&mut state, account))
+        self.acquire_amount(account, 1)
     }
 
-    /// Grants a permit if one is free, without regard to the shares of the holders.
+    /// [`Self::acquire`] for a permit that counts for `amount`, in units of the resource.
+    ///
+    /// # Errors
+    /// As for [`Self::acquire`].
+    pub fn acquire_amount(&self, account: &Account, amount: usize) -> Result<Permit> {
+        let mut state = lock(&self.0.state);
+        self.0.make_room(&mut state, account, amount)?;
+        Ok(self.grant(&mut state, account, amount))
+    }
+
+    /// Grants a permit that counts as one if one is free, without regard to the shares of the holders.
     ///
     /// # Errors
     /// `LimitReached` when no permit is free.
     pub fn acquire_any(&self, account: &Account) -> Result<Permit> {
         let mut state = lock(&self.0.state);
-        match state.holders.count() < self.0.share.total {
-            true => Ok(self.grant(&mut state, account)),
+        match state.holders.amount() < self.0.share.total {
+            true => Ok(self.grant(&mut state, account, 1)),
             false => Err(self.0.refuse()),
         }
+    }
+
+    /// Counts what an account holds already, also beyond the limit.
+    pub fn count_held(&self, account: &Account, amount: usize) -> Permit {
+        self.grant(&mut lock(&self.0.state), account, amount)
     }
 
     /// Checks whether [`Self::acquire`] would grant a permit now.
@@ -97,15 +106,14 @@ impl PermitPool {
     /// # Errors
     /// `LimitReached`.
     pub fn check(&self, account: &Account) -> Result<()> {
-        let state = lock(&self.0.state);
-        match state.holders.decide(account, self.0.share) {
+        match lock(&self.0.state).holders.decide(account, 1, self.0.share) {
             Decision::Grant | Decision::Preempt(_) => Ok(()),
             Decision::Refuse => Err(self.0.refuse()),
         }
     }
 
-    fn grant(&self, state: &mut State, account: &Account) -> Permit {
-        let grant = Grant::new(account);
+    fn grant(&self, state: &mut State, account: &Account, amount: usize) -> Permit {
+        let grant = Grant::new(account, amount);
         state.holders.insert(account, Arc::clone(&grant));
         Permit(PermitHandle { pool: Arc::clone(&self.0), grant })
     }
@@ -113,19 +121,19 @@ impl PermitPool {
     /// Preempts the permit that is next in order.
     pub fn preempt_one(&self) {
         let mut state = lock(&self.0.state);
-        if let Some(victim) = state.holders.find_any(self.0.share) {
+        for victim in state.holders.find_any(self.0.share) {
             self.0.preempt(&mut state, &victim);
         }
     }
 
-    /// Number of permits that can be granted at a time.
+    /// The limit on the amounts of all permits together.
     pub fn total(&self) -> usize {
         self.0.share.total
     }
 
-    /// Number of permits that are granted and not preempted.
+    /// The amount of all permits that are granted and not preempted.
     pub fn held(&self) -> usize {
-        lock(&self.0.state).holders.count()
+        lock(&self.0.state).holders.amount()
     }
 
     /// Number of preempted permits that are not dropped yet.
@@ -140,6 +148,18 @@ impl PermitPool {
 }
 
 impl Shared {
+    /// Makes `amount` available to a client, if necessary by preemption.
+    fn make_room(&self, state: &mut State, account: &Account, amount: usize) -> Result<()> {
+        match state.holders.decide(account, amount, self.share) {
+            Decision::Grant => Ok(()),
+            Decision::Preempt(victims) => {
+                victims.iter().for_each(|victim| self.preempt(state, victim));
+                Ok(())
+            }
+            Decision::Refuse => Err(self.refuse()),
+        }
+    }
+
     /// Counts a refusal and returns its error.
     fn refuse(&self) -> Error {
         self.metrics.refused.inc();
@@ -179,6 +199,30 @@ impl Permit {
     pub const fn handle(&self) -> &PermitHandle {
         &self.0
     }
+
+    /// What the permit counts for, in units of its resource.
+    pub fn amount(&self) -> usize {
+        self.0.grant.amount()
+    }
+
+    /// Changes what the permit counts for. Less is always granted.
+    ///
+    /// # Errors
+    /// As for [`PermitPool::acquire`], and the error of a preempted permit. The amount is then unchanged.
+    pub fn resize(&mut self, amount: usize) -> Result<()> {
+        let PermitHandle { pool, grant } = &self.0;
+        let mut state = lock(&pool.state);
+        if let Some(error) = self.0.preemption() {
+            return Err(error);
+        }
+        let account = lock(&grant.account).clone();
+        if let Some(added) = amount.checked_sub(grant.amount()).filter(|added| *added > 0) {
+            // The victims are not this permit: they belong to a client that holds more than this one will.
+            pool.make_room(&mut state, &account, added)?;
+        }
+        state.holders.resize(&account, grant, amount);
+        Ok(())
+    }
 }
 
 impl PermitHandle {
@@ -192,11 +236,11 @@ impl PermitHandle {
         lock(&self.grant.account).clone()
     }
 
-    /// Moves an anonymous permit to the account of a principal. Has no effect on a permit of a principal, and then takes no
-    /// lock.
-    pub fn identify(&self, account: impl FnOnce() -> Account) {
+    /// Moves an anonymous permit to the account of a principal, and returns true. Has no effect on a permit of a principal,
+    /// and then takes no lock.
+    pub fn identify(&self, account: impl FnOnce() -> Account) -> bool {
         if self.grant.has_principal.swap(true, Ordering::Relaxed) {
-            return;
+            return false;
         }
         let account = account();
         let mut state = lock(&self.pool.state);
@@ -205,6 +249,7 @@ impl PermitHandle {
             state.holders.remove(&former, &self.grant);
             state.holders.insert(&account, Arc::clone(&self.grant));
         }
+        true
     }
 
     /// Waits until the permit is preempted, and returns the error with which its holder ends. Cancel-safe.
@@ -222,6 +267,11 @@ impl PermitHandle {
 
     pub fn is_preempted(&self) -> bool {
         self.grant.preemption.borrow().is_some()
+    }
+
+    /// The error with which the holder ends, if the permit is preempted.
+    pub fn preemption(&self) -> Option<Error> {
+        self.grant.preemption.borrow().clone()
     }
 }
 

@@ -1,5 +1,6 @@
 //! The rule by which the permits of a pool are shared; see the documentation of the module.
 
+use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -7,12 +8,11 @@ use super::account::{Account, Client};
 use super::grant::Grant;
 use super::limits::WhenFull;
 
-/// What a pool permits.
+/// What a pool permits. Amounts are in units of its resource: permits or bytes.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Share {
-    /// Number of permits.
     pub(super) total: usize,
-    /// Number of permits that a single client leaves for others.
+    /// What a single client leaves for others.
     pub(super) reserve: usize,
     pub(super) when_full: WhenFull,
 }
@@ -21,8 +21,8 @@ pub(super) struct Share {
 #[derive(Debug)]
 pub(super) enum Decision {
     Grant,
-    /// Grant it after the preemption of this one.
-    Preempt(Arc<Grant>),
+    /// Grant it after the preemption of these.
+    Preempt(Vec<Arc<Grant>>),
     Refuse,
 }
 
@@ -31,69 +31,95 @@ pub(super) enum Decision {
 pub(super) struct Holders {
     /// By name. The permits of anonymous clients have the key `None`.
     principals: BTreeMap<Option<Arc<str>>, PrincipalHolders>,
-    count: usize,
+    amount: usize,
 }
 
 #[derive(Debug, Default)]
 struct PrincipalHolders {
-    clients: BTreeMap<Client, Vec<Arc<Grant>>>,
-    count: usize,
+    clients: BTreeMap<Client, ClientHolder>,
+    amount: usize,
 }
 
-/// Whether a holder of `own` permits may take one of a holder of `other`: it then has at most as many, or has none and
-/// replaces one with less progress.
-const fn may_take(own: usize, other: usize) -> bool {
-    own + 1 < other || (own == 0 && other > 0)
+#[derive(Debug, Default)]
+struct ClientHolder {
+    grants: Vec<Arc<Grant>>,
+    amount: usize,
+}
+
+/// Whether a holder of `own` may take `amount` from a holder of `other`: it then has less, or has nothing and replaces
+/// what has less progress.
+const fn may_take(own: usize, amount: usize, other: usize) -> bool {
+    own.saturating_add(amount) < other || (own == 0 && amount <= other)
 }
 
 impl Holders {
-    pub(super) const fn count(&self) -> usize {
-        self.count
+    pub(super) const fn amount(&self) -> usize {
+        self.amount
     }
 
     pub(super) fn insert(&mut self, account: &Account, grant: Arc<Grant>) {
+        let amount = grant.amount();
         let principal = self.principals.entry(account.principal.clone()).or_default();
-        principal.clients.entry(account.client).or_default().push(grant);
-        principal.count += 1;
-        self.count += 1;
+        let client = principal.clients.entry(account.client).or_default();
+        client.grants.push(grant);
+        client.amount += amount;
+        principal.amount += amount;
+        self.amount += amount;
     }
 
     /// Removes a permit. Has no effect if the account does not hold it.
     pub(super) fn remove(&mut self, account: &Account, grant: &Arc<Grant>) {
         let Some(principal) = self.principals.get_mut(&account.principal) else { return };
-        let Some(grants) = principal.clients.get_mut(&account.client) else { return };
-        let Some(index) = grants.iter().position(|held| Arc::ptr_eq(held, grant)) else { return };
-        grants.remove(index);
-        principal.count -= 1;
-        self.count -= 1;
-        if grants.is_empty() {
+        let Some(client) = principal.clients.get_mut(&account.client) else { return };
+        let Some(index) = client.grants.iter().position(|held| Arc::ptr_eq(held, grant)) else { return };
+        client.grants.swap_remove(index);
+        let amount = grant.amount();
+        client.amount -= amount;
+        principal.amount -= amount;
+        self.amount -= amount;
+        if client.grants.is_empty() {
             principal.clients.remove(&account.client);
         }
-        if principal.count == 0 {
+        if principal.clients.is_empty() {
             self.principals.remove(&account.principal);
         }
     }
 
-    /// Number of permits of a client.
-    pub(super) fn held_by(&self, account: &Account) -> usize {
-        let principal = self.principals.get(&account.principal);
-        principal.and_then(|principal| principal.clients.get(&account.client)).map_or(0, Vec::len)
+    /// Changes the amount of a permit that the account holds.
+    pub(super) fn resize(&mut self, account: &Account, grant: &Grant, amount: usize) {
+        let former = grant.set_amount(amount);
+        let Some(principal) = self.principals.get_mut(&account.principal) else { return };
+        let Some(client) = principal.clients.get_mut(&account.client) else { return };
+        for held in [&mut client.amount, &mut principal.amount, &mut self.amount] {
+            *held = *held - former + amount;
+        }
     }
 
-    /// Answers a client that asks for a permit.
-    pub(super) fn decide(&self, account: &Account, share: Share) -> Decision {
-        if self.held_by(account) + share.reserve >= share.total {
+    /// What a client holds.
+    pub(super) fn held_by(&self, account: &Account) -> usize {
+        let principal = self.principals.get(&account.principal);
+        principal.and_then(|principal| principal.clients.get(&account.client)).map_or(0, |client| client.amount)
+    }
+
+    /// Answers a client that asks for an amount.
+    pub(super) fn decide(&self, account: &Account, amount: usize, share: Share) -> Decision {
+        let held = self.held_by(account);
+        if held.saturating_add(amount).saturating_add(share.reserve) > share.total {
             return Decision::Refuse;
         }
-        let free = share.total.saturating_sub(self.count);
+        let free = share.total.saturating_sub(self.amount);
         match share.when_full {
-            WhenFull::Preempt if free > 0 => Decision::Grant,
-            WhenFull::Preempt => self.find_for(account, share).map_or(Decision::Refuse, Decision::Preempt),
+            WhenFull::Preempt if free >= amount => Decision::Grant,
+            WhenFull::Preempt => {
+                let victims = self.find_for(account, amount, amount - free, share);
+                if victims.is_empty() { Decision::Refuse } else { Decision::Preempt(victims) }
+            }
             WhenFull::Refuse { minimum } => {
-                let of_principal = self.principals.get(&account.principal).map_or(0, |principal| principal.count);
-                let is_free_for_all = free > share.reserve;
-                let is_for_new_client = free > minimum.min(share.reserve) && self.held_by(account) == 0;
-                let is_for_principal = free > 0 && of_principal < minimum;
+                let of_principal = self.principals.get(&account.principal).map_or(0, |principal| principal.amount);
+                let Some(left) = free.checked_sub(amount) else { return Decision::Refuse };
+                let is_free_for_all = left >= share.reserve;
+                let is_for_new_client = left >= minimum.min(share.reserve) && held == 0;
+                let is_for_principal = of_principal.saturating_add(amount) <= minimum;
                 match is_free_for_all || is_for_new_client || is_for_principal {
                     true => Decision::Grant,
                     false => Decision::Refuse,
@@ -102,30 +128,35 @@ impl Holders {
         }
     }
 
-    /// The permit that is preempted for a client. `None` if the client has its share.
-    fn find_for(&self, account: &Account, share: Share) -> Option<Arc<Grant>> {
-        let (largest, principal) = self.largest_principal(share)?;
+    /// The permits that are preempted for a client that asks for `amount`, of which `missing` is not free. None if the
+    /// client has its share.
+    fn find_for(&self, account: &Account, amount: usize, missing: usize, share: Share) -> Vec<Arc<Grant>> {
+        let Some((largest, principal)) = self.largest_principal(share) else { return Vec::new() };
         let own = self.principals.get(&account.principal);
-        let is_entitled =
-            is_crowded(largest, principal, share) || may_take(own.map_or(0, |own| own.count), principal.count);
-        let (name, principal) = if is_entitled { (largest, principal) } else { (&account.principal, own?) };
+        let is_entitled = is_crowded(largest, principal, share)
+            || may_take(own.map_or(0, |own| own.amount), amount, principal.amount);
+        let (name, principal) = match (is_entitled, own) {
+            (true, _) => (largest, principal),
+            (false, Some(own)) => (&account.principal, own),
+            (false, None) => return Vec::new(),
+        };
         let is_own = *name == account.principal;
-        if is_own && !may_take(self.held_by(account), principal.largest_client()) {
-            return None;
+        if is_own && !may_take(self.held_by(account), amount, principal.largest_client()) {
+            return Vec::new();
         }
-        principal.least_progress(share)
+        principal.find_victims(missing, share)
     }
 
     /// The next permit to preempt, for any client.
-    pub(super) fn find_any(&self, share: Share) -> Option<Arc<Grant>> {
-        self.largest_principal(share)?.1.least_progress(share)
+    pub(super) fn find_any(&self, share: Share) -> Vec<Arc<Grant>> {
+        self.largest_principal(share).map_or_else(Vec::new, |(_, principal)| principal.find_victims(1, share))
     }
 
-    /// The principal that holds the most permits. Anonymous clients count as one principal, and go first if they hold more
-    /// than the reserve: fewer may be clients whose first call is still on its way.
+    /// The principal that holds the most. Anonymous clients count as one principal, and go first if they hold more than
+    /// the reserve: less may be of clients whose first call is still on its way.
     fn largest_principal(&self, share: Share) -> Option<(&Option<Arc<str>>, &PrincipalHolders)> {
         let rank = |name: &Option<Arc<str>>, principal: &PrincipalHolders| {
-            (is_crowded(name, principal, share), principal.count, name.is_none())
+            (is_crowded(name, principal, share), principal.amount, name.is_none())
         };
         self.principals.iter().max_by_key(|(name, principal)| rank(name, principal))
     }
@@ -133,28 +164,43 @@ impl Holders {
 
 /// Whether anonymous clients hold more than the reserve.
 fn is_crowded(name: &Option<Arc<str>>, principal: &PrincipalHolders, share: Share) -> bool {
-    name.is_none() && principal.count > share.reserve
+    name.is_none() && principal.amount > share.reserve
 }
 
 impl PrincipalHolders {
-    /// The largest number of permits of a client.
+    /// What the client holds that holds the most.
     fn largest_client(&self) -> usize {
-        self.clients.values().map(Vec::len).max().unwrap_or(0)
+        self.clients.values().map(|client| client.amount).max().unwrap_or(0)
     }
 
-    /// Among the clients that hold the most, the permit that has made no progress for the longest time. A permit without
-    /// any progress belongs to a client that has just come, or does not work. Such permits go first if there are more than
-    /// the reserve, and last otherwise, so that clients that come do not preempt each other before their first progress.
-    fn least_progress(&self, share: Share) -> Option<Arc<Grant>> {
+    /// Permits that count for `missing` together; fewer if there are not so many. Those of the client that holds the most
+    /// come first, and among these, the one that has made no progress for the longest time. A permit without any progress
+    /// belongs to a client that has just come, or does not work. Such permits go first if the largest clients have more of
+    /// them than the reserve, and last otherwise, so that clients that come do not preempt each other before their first
+    /// progress.
+    fn find_victims(&self, missing: usize, share: Share) -> Vec<Arc<Grant>> {
         let largest = self.largest_client();
-        let candidates = || self.clients.values().filter(|grants| grants.len() == largest).flatten();
-        let new = candidates().filter(|grant| grant.last_progress().is_none()).count();
-        let is_crowded = new > share.reserve;
-        let rank = |grant: &&Arc<Grant>| match grant.last_progress() {
+        let of_largest = self.clients.values().filter(|client| client.amount == largest);
+        let new = of_largest.flat_map(|client| &client.grants).filter(|grant| grant.last_progress().is_none());
+        let is_crowded = new.map(|grant| grant.amount()).sum::<usize>() > share.reserve;
+        let progress = |grant: &Grant| match grant.last_progress() {
             Some(time) => (is_crowded, time),
             None => (!is_crowded, grant.granted_at()),
         };
-        candidates().min_by_key(rank).cloned()
+        let mut candidates: Vec<_> = self
+            .clients
+            .values()
+            .flat_map(|client| client.grants.iter().map(|grant| (Reverse(client.amount), progress(grant), grant)))
+            .filter(|(_, _, grant)| grant.amount() > 0)
+            .collect();
+        candidates.sort_unstable_by_key(|(amount, progress, _)| (*amount, *progress));
+        let mut found = 0;
+        let mut is_needed = |grant: &Grant| {
+            let is_missing = found < missing;
+            found += grant.amount();
+            is_missing
+        };
+        candidates.into_iter().map(|(_, _, grant)| grant).take_while(|grant| is_needed(grant)).cloned().collect()
     }
 }
 

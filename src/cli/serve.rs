@@ -161,10 +161,7 @@ pub(super) struct Args {
     /// Largest upload of one scene, in bytes.
     #[arg(long, default_value_t = Config::default().upload_bytes)]
     upload_bytes: u64,
-    /// Limit on the uploads of one client, in bytes.
-    #[arg(long, default_value_t = Config::default().client_upload_bytes)]
-    client_upload_bytes: u64,
-    /// Limit on all uploads on disk, in bytes.
+    /// Limit on all uploads on disk, in bytes. A single principal leaves a quarter for others.
     #[arg(long, default_value_t = Config::default().stored_bytes)]
     stored_bytes: u64,
     /// Deadline of a request that sets none, in milliseconds.
@@ -236,7 +233,6 @@ impl Args {
             max_window: defaults.max_window.max(self.window),
             stall_budget: Duration::from_millis(self.stall_budget_ms),
             upload_bytes: self.upload_bytes,
-            client_upload_bytes: self.client_upload_bytes,
             stored_bytes: self.stored_bytes,
             deadline: Duration::from_millis(self.deadline_ms),
             device_work_limit: Duration::from_millis(self.device_work_limit_ms),

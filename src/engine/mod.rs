@@ -37,7 +37,7 @@ mod source;
 mod storage;
 #[cfg(test)]
 mod testing;
-mod upload_quota;
+mod upload_permits;
 
 pub(crate) use blocking::run_blocking;
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
@@ -104,7 +104,7 @@ use self::storage::run_counter::RunCounter;
 use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
-use self::upload_quota::{UploadPermit, UploadQuota};
+use self::upload_permits::{UploadPermit, UploadPermits};
 use crate::admission::{Account, AdmissionMetrics, Client, Limit};
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
@@ -127,7 +127,7 @@ struct Shared {
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
     load_permits: LoadPermits,
-    upload_quota: Arc<UploadQuota>,
+    upload_permits: Arc<UploadPermits>,
     /// Whether every scene of the last run is open or has failed.
     are_scenes_reopened: watch::Sender<bool>,
     next_scene_id: AtomicU64,
@@ -171,8 +171,7 @@ impl Engine {
         open_device: impl FnOnce() -> Result<DeviceContext> + Send + 'static,
     ) -> Result<Self> {
         let state = config.state.clone();
-        let quota_config = Arc::clone(&config);
-        let (scene_catalog, crash_log, checkpoints, run_counter, upload_quota) =
+        let (scene_catalog, crash_log, checkpoints, run_counter, stored_uploads) =
             run_blocking("state folder", move || {
                 let file_system: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
                 let scene_catalog = SceneCatalog::open(&state, &file_system)?;
@@ -180,8 +179,8 @@ impl Engine {
                 let crash_log = CrashLog::open(&state, &file_system, |scene| scenes.contains_key(scene));
                 let run_counter = Arc::new(RunCounter::open(&state, &file_system)?);
                 let checkpoints = CheckpointStore::start(scene_catalog.checkpoint_folder(), &file_system)?;
-                let upload_quota = UploadQuota::new(&quota_config, scene_catalog.stored_uploads());
-                Ok((scene_catalog, Arc::new(crash_log), Arc::new(checkpoints), run_counter, upload_quota))
+                let stored_uploads = scene_catalog.stored_uploads();
+                Ok((scene_catalog, Arc::new(crash_log), Arc::new(checkpoints), run_counter, stored_uploads))
             })
             .await?;
         if let Some(Err(error)) = crash_log.file().map(crash_signals::install) {
@@ -191,6 +190,10 @@ impl Engine {
         let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(open_device, config.device_work_limit, owners).await?;
         let admission_metrics = AdmissionMetrics::default();
+        let upload_permits = UploadPermits::new(&config, &admission_metrics);
+        for upload in stored_uploads {
+            upload_permits.store(&upload.scene, Some(upload.owner.into()), upload.bytes);
+        }
         let shared = Shared {
             services: SceneServices {
                 device: handle,
@@ -208,7 +211,7 @@ impl Engine {
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
             load_permits: LoadPermits::new(),
-            upload_quota,
+            upload_permits,
             are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),
             is_stopping: AtomicBool::new(false),
@@ -413,8 +416,8 @@ impl Engine {
     ///
     /// # Errors
     /// `Invalid` for a malformed name or entry path and for counts or sizes over the limits; `NameTaken` when the name
-    /// is in use; `Busy` when too many uploads are in progress; `LimitReached` when the client has too many uploads, or
-    /// too many bytes would be stored; `Fault` of the disk.
+    /// is in use; `LimitReached` when the client has its share of the uploads in progress, or the principal has its share
+    /// of the stored bytes; `Fault` of the disk.
     pub async fn begin_upload(&self, header: UploadHeader, principal: &Principal, client: Client) -> Result<Upload> {
         self.check_running()?;
         validate_scene_name(&header.scene)?;
@@ -466,7 +469,7 @@ impl Engine {
         let account = Account::new(principal, client);
         self.check_replacement(scene, principal)?;
         self.shared.registry.check_upload(scene, principal, &account)?;
-        self.shared.upload_quota.admit(account, bytes)
+        self.shared.upload_permits.admit(account, bytes)
     }
 
     /// For each hash, whether a file of a principal's uploads has this content.

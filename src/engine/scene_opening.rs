@@ -165,7 +165,7 @@ impl Engine {
             let engine = self.clone();
             let remove = move || {
                 engine.shared.scene_catalog.remove_upload(&name);
-                engine.shared.upload_quota.remove(&name);
+                engine.shared.upload_permits.remove(&name);
                 Ok(())
             };
             run_blocking("upload", remove).await?;
@@ -268,7 +268,8 @@ impl Engine {
                     let account = upload.account().cloned();
                     upload.commit(&upload_folder)?;
                     if let Some(account) = account {
-                        engine.shared.upload_quota.store(&scene_name, account, folder_bytes(&upload_folder));
+                        let bytes = folder_bytes(&upload_folder);
+                        engine.shared.upload_permits.store(&scene_name, account.principal, bytes);
                     }
                 }
                 let hashes = Arc::new(read_hashes(&upload_folder)?);
@@ -299,7 +300,7 @@ impl Engine {
             engine.shared.services.checkpoints.remove(&scene_name);
             engine.shared.crash_log.forget(&scene_name);
             let is_removed = engine.shared.scene_catalog.remove(&scene_name);
-            engine.shared.upload_quota.remove(&scene_name);
+            engine.shared.upload_permits.remove(&scene_name);
             is_removed
         })
         .await;

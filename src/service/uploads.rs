@@ -10,11 +10,15 @@ use tonic::{Request, Status, Streaming};
 use super::caller::Caller;
 use super::convert::{parse_array_upload_header, parse_upload_header, parse_uploaded_domain};
 use super::status::{to_status, transport_status};
+use crate::admission::PermitHandle;
 use crate::engine::{ArrayUpload, Engine, Upload};
 use modalcast_model::error::{Error, Result, fault_in};
 
 /// The lowest sustained upload rate that the server accepts, in bytes per second: 32 KiB/s.
 const MIN_UPLOAD_RATE: f64 = 32768.0;
+
+/// An upload makes progress with each so many bytes. A slow one does so rarely, and ends first for a new client.
+const PROGRESS_BYTES: usize = 1 << 20;
 
 /// An upload whose parts arrive in a stream.
 pub(super) trait StreamedUpload: Sized + Send + 'static {
@@ -29,6 +33,9 @@ pub(super) trait StreamedUpload: Sized + Send + 'static {
 
     /// Adds a later part. Blocks on the disk.
     fn add_part(&mut self, part: Self::Part) -> Result<()>;
+
+    /// The permit of the upload.
+    fn permit(&self) -> Option<&PermitHandle>;
 
     /// Removes the files. Blocks on the disk.
     fn discard(self);
@@ -67,6 +74,10 @@ impl StreamedUpload for Upload {
         }
     }
 
+    fn permit(&self) -> Option<&PermitHandle> {
+        self.permit()
+    }
+
     fn discard(self) {
         Self::discard(self);
     }
@@ -100,6 +111,10 @@ impl StreamedUpload for ArrayUpload {
             ArraysPart::Chunk(bytes) => self.write_chunk(&bytes),
             ArraysPart::Header(_) => Err(second_header()),
         }
+    }
+
+    fn permit(&self) -> Option<&PermitHandle> {
+        self.permit()
     }
 
     fn discard(self) {
@@ -137,15 +152,36 @@ async fn receive_parts<U: StreamedUpload>(
     use prost::Message as _;
     let max_message_bytes = engine.config().message_bytes;
     let mut budget = UploadTimeBudget::new(engine.config().upload_stall_budget);
-    while let Some(request) =
-        budget.wait(parts.message()).await?.map_err(|status| transport_status(status, max_message_bytes))?
-    {
-        budget.refill(request.encoded_len());
+    let mut received_bytes = 0;
+    loop {
+        let permit = upload.as_ref().and_then(U::permit).cloned();
+        let message = unless_preempted(permit.as_ref(), budget.wait(parts.message())).await?;
+        let Some(request) = message.map_err(|status| transport_status(status, max_message_bytes))? else { break };
+        let bytes = request.encoded_len();
+        budget.refill(bytes);
+        received_bytes += bytes;
+        if let Some(permit) = permit.filter(|_| received_bytes >= PROGRESS_BYTES) {
+            permit.mark_progress();
+            received_bytes = 0;
+        }
         let part = U::part_of(request)
             .ok_or_else(|| to_status(Error::UnexpectedMessage { expected: "a part", given: "an empty message" }))?;
         *upload = Some(receive_part(engine, caller, upload.take(), part).await.map_err(to_status)?);
     }
     Ok(())
+}
+
+/// Waits for a part of an upload, unless the upload ends for another client.
+async fn unless_preempted<T>(
+    permit: Option<&PermitHandle>,
+    part: impl Future<Output = Result<T, Status>>,
+) -> Result<T, Status> {
+    let Some(permit) = permit else { return part.await };
+    tokio::select! {
+        biased;
+        error = permit.preempted() => Err(to_status(error)),
+        part = part => part,
+    }
 }
 
 /// Processes one part of an upload. Discards the upload if that fails. Disk access runs on the blocking pool.

@@ -145,3 +145,32 @@ async fn open_scenes_are_shared_between_clients() {
     SceneServiceClient::new(greedy.clone()).delete_scene(request).await.expect("expected a closed scene");
     open(&server.channel().await, "e".into()).await.expect("expected a scene of a new client");
 }
+
+/// An upload that begins and does not go on. Returns its error.
+async fn begin_upload(channel: Channel, scene: String) -> Status {
+    let header = v1::UploadHeader { scene, files: 1, total_bytes: 10, ..Default::default() };
+    let part = v1::UploadSceneRequest { part: Some(v1::upload_scene_request::Part::Header(header)) };
+    let parts = tokio_stream::StreamExt::chain(tokio_stream::once(part), tokio_stream::pending());
+    SceneServiceClient::new(channel).upload_scene(parts).await.expect_err("expected an upload without an end")
+}
+
+/// A client with as many uploads as it can have leaves some for others, and loses one when there are none left.
+#[tokio::test(flavor = "multi_thread")]
+async fn uploads_are_shared_between_clients() {
+    let server = Server::start_with(|config| config).await;
+    let (mut of_greedy, mut of_others) = (JoinSet::new(), JoinSet::new());
+    let greedy = server.channel().await;
+    for number in 0..29 {
+        of_greedy.spawn(begin_upload(greedy.clone(), format!("a{number}")));
+    }
+    let refused = with_timeout(of_greedy.join_next()).await.expect("a task").expect("expected no panic");
+    assert_eq!(rejection_details(&refused).reason(), Reason::LimitReached, "expected 28 uploads of one client");
+    for number in 0..5 {
+        of_others.spawn(begin_upload(server.channel().await, format!("b{number}")));
+    }
+    let ended = with_timeout(of_greedy.join_next()).await.expect("a task").expect("expected no panic");
+    assert_preempted(&ended, "uploads in progress", 28, 32);
+    assert_eq!(server.preempted("uploads"), 1);
+    assert_eq!((of_greedy.len(), of_others.len()), (27, 5));
+    assert!(of_others.try_join_next().is_none() && of_greedy.try_join_next().is_none());
+}

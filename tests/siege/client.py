@@ -119,9 +119,14 @@ def upload_parts(name, files):
             yield scenes_pb2.UploadSceneRequest(chunk=data[start : start + (1 << 20)])
 
 
-def upload_files(client, name, files, timeout=60):
+def upload_files(client, name, files, timeout=60, metadata=()):
     """Uploads files and opens them as a scene."""
-    return client.scenes.UploadScene(upload_parts(name, files), timeout=timeout).scene
+    return client.scenes.UploadScene(upload_parts(name, files), timeout=timeout, metadata=metadata).scene
+
+
+def bearer(token):
+    """The metadata of calls with a token."""
+    return [("authorization", f"Bearer {token}")]
 
 
 def time_to_serve(server, timeout, metadata=()):

@@ -4,7 +4,7 @@ import threading
 import time
 
 import grpc
-from client import common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, steps_pb2, vertices_pb2
+from client import bearer, common_pb2, forces_pb2, frames_pb2, scenes_pb2, states_pb2, steps_pb2, vertices_pb2
 from client import LIST_SCENES
 from report import Result, mb
 from server import Peak, Server
@@ -21,10 +21,6 @@ DURATION = 8.0
 # Seconds within which the owner must be served meanwhile, and by how many bytes the memory may grow.
 MAX_SECONDS = 0.25
 MAX_MEMORY = 256 << 20
-
-
-def bearer(token):
-    return [("authorization", f"Bearer {token}")]
 
 
 def connect(server):

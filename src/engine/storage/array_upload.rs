@@ -14,8 +14,9 @@ use sha2::{Digest as _, Sha256};
 use super::file_system::{FileSystem, StateFile};
 use super::upload::CompleteUpload;
 use super::upload_folder::UploadFolder;
+use crate::admission::PermitHandle;
 use crate::engine::content::ContentHash;
-use crate::engine::upload_quota::UploadPermit;
+use crate::engine::upload_permits::UploadPermit;
 use modalcast_model::domain::{Corners, CreaseAngle, MAX_RANK, Mesh, Modes, RestOrigin, Shape};
 use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::memory::MemoryReservation;
@@ -231,6 +232,11 @@ impl ArrayUpload {
     /// The up axis of the scene and of its meshes in `scene.toml`.
     const fn up(&self) -> &'static str {
         self.header.up.name()
+    }
+
+    /// The permit of the upload.
+    pub fn permit(&self) -> Option<&PermitHandle> {
+        self.folder.permit()
     }
 
     /// Number of domains so far.

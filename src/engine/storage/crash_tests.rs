@@ -18,11 +18,11 @@ use super::run_counter::RunCounter;
 use super::scene_catalog::SceneCatalog;
 use super::scene_record::{SceneAccess, SceneRecord};
 use super::upload::{CompleteUpload, Upload, UploadHeader};
-use crate::admission::Account;
+use crate::admission::{Account, AdmissionMetrics};
 use crate::config::Config;
 use crate::engine::lock::lock;
 use crate::engine::testing;
-use crate::engine::upload_quota::{UploadPermit, UploadQuota};
+use crate::engine::upload_permits::{UploadPermit, UploadPermits};
 use crate::identity::Principal;
 use modalcast_model::domain::Transform;
 use modalcast_model::memory::MemoryReservation;
@@ -322,8 +322,8 @@ impl Recorder {
     }
 
     fn permit() -> UploadPermit {
-        let quota = UploadQuota::new(&Config::default(), BTreeMap::new());
-        quota.admit(Account::server(), 1).expect("expected a free place")
+        let permits = UploadPermits::new(&Config::default(), &AdmissionMetrics::default());
+        permits.admit(Account::server(), 1).expect("expected a free place")
     }
 
     fn upload(&mut self, name: &str, files: &[(&str, &str)]) {

@@ -22,6 +22,15 @@ pub(in crate::engine) struct SceneCatalog {
     folder_lock: Mutex<Option<File>>,
 }
 
+/// The files of an uploaded scene.
+#[derive(Debug)]
+pub(in crate::engine) struct UploadSize {
+    pub(in crate::engine) scene: String,
+    /// The principal to whom they belong.
+    pub(in crate::engine) owner: String,
+    pub(in crate::engine) bytes: u64,
+}
+
 impl SceneCatalog {
     /// Locks the folder and brings it into a consistent state, see [`Recovery`].
     ///
@@ -91,10 +100,14 @@ impl SceneCatalog {
         }
     }
 
-    /// The sizes in bytes of all uploads, by the names of their scenes.
-    pub(in crate::engine) fn stored_uploads(&self) -> BTreeMap<String, u64> {
+    /// All uploads. Blocks on the disk.
+    pub(in crate::engine) fn stored_uploads(&self) -> Vec<UploadSize> {
         let uploads = self.entries().into_iter().filter(|(_, record)| record.is_upload());
-        uploads.map(|(name, _)| (name.clone(), folder_bytes(&self.upload_folder(&name)))).collect()
+        let to_size = |(scene, record): (String, SceneRecord)| {
+            let bytes = folder_bytes(&self.upload_folder(&scene));
+            UploadSize { scene, owner: record.access.owner, bytes }
+        };
+        uploads.map(to_size).collect()
     }
 
     /// The folders of the uploads that belong to a principal.

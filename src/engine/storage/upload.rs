@@ -13,9 +13,9 @@ use sha2::{Digest as _, Sha256};
 use super::file_system::{FileSystem, StateFile};
 use super::upload_folder::UploadFolder;
 use super::upload_record::{RECORD_NAME, UploadRecord, UploadedFiles, find_uploaded_files};
-use crate::admission::Account;
+use crate::admission::{Account, PermitHandle};
 use crate::engine::content::{ContentHash, hex, parse_hash};
-use crate::engine::upload_quota::UploadPermit;
+use crate::engine::upload_permits::UploadPermit;
 use modalcast_model::error::{Error, Result, fault, fault_in, invalid};
 
 /// Limit on the length of a path in bytes.
@@ -142,6 +142,11 @@ impl Upload {
             reusable_folders,
             uploaded_files: None,
         })
+    }
+
+    /// The permit of the upload.
+    pub fn permit(&self) -> Option<&PermitHandle> {
+        self.folder.permit()
     }
 
     /// Begins the next file. `bytes` is its size; `sha256` must have 32 bytes.
@@ -321,13 +326,14 @@ mod tests {
 
     use super::super::file_system::DiskFileSystem;
     use super::*;
+    use crate::admission::AdmissionMetrics;
     use crate::config::Config;
-    use crate::engine::upload_quota::UploadQuota;
+    use crate::engine::upload_permits::UploadPermits;
 
     fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
-        let quota = UploadQuota::new(&Config::default(), BTreeMap::new());
-        let permit = quota.admit(Account::server(), total_bytes).expect("expected a free permit");
+        let permits = UploadPermits::new(&Config::default(), &AdmissionMetrics::default());
+        let permit = permits.admit(Account::server(), total_bytes).expect("expected a free permit");
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
         Upload::begin(folder, &disk, header, permit, vec![folder.join("known")]).expect("expected a temporary folder")
     }

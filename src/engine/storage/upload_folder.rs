@@ -7,8 +7,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::file_system::FileSystem;
-use crate::admission::Account;
-use crate::engine::upload_quota::UploadPermit;
+use crate::admission::{Account, PermitHandle};
+use crate::engine::upload_permits::UploadPermit;
 use modalcast_model::error::{Result, fault, fault_in};
 
 /// Number of uploads so far. Makes the names of temporary folders unique.
@@ -43,6 +43,11 @@ impl UploadFolder {
 
     pub(super) fn file_system(&self) -> &dyn FileSystem {
         &*self.file_system
+    }
+
+    /// The permit of the upload. `None` after the folder was moved or removed.
+    pub(super) fn permit(&self) -> Option<&PermitHandle> {
+        self.permit.as_ref().map(|permit| permit.upload.handle())
     }
 
     /// The client that uploads.
