@@ -239,11 +239,8 @@ pub struct Config {
     pub allow_software: bool,
     /// The largest message that the server accepts, in bytes.
     pub message_bytes: usize,
-    /// Limit in bytes on the messages that one connection is sending; `receive_bytes` limits those of all connections.
-    /// An incomplete message counts with its whole length. A request above the limit of its connection is rejected.
-    /// Above the total, the connection that holds the most loses its incomplete messages.
-    pub connection_receive_bytes: usize,
-    /// See `connection_receive_bytes`: the limit of all connections.
+    /// Limit in bytes on the messages that clients are sending, which they share; see `modalcast::admission`. An incomplete
+    /// message counts with its whole length. At least twice the largest message, so that one does not take the share of all.
     pub receive_bytes: usize,
     /// Longest time without progress of an incomplete message. Progress below 32 KiB/s extends it only in part.
     pub message_timeout: Duration,
@@ -344,7 +341,6 @@ impl Default for Config {
             encode: EncodeChoice::Cpu,
             allow_software: true,
             message_bytes: 16 << 20,
-            connection_receive_bytes: 32 << 20,
             receive_bytes: 128 << 20,
             message_timeout: Duration::from_secs(10),
             connection_reply_bytes: 64 << 20,
@@ -437,9 +433,7 @@ impl Config {
         const HOUR_MS: u64 = 3_600_000;
         check_range("message_bytes", self.message_bytes as u64, 64 << 10, 1 << 30)?;
         let max_budget = u64::from(u32::MAX);
-        let (message_bytes, receive_bytes) = (self.message_bytes as u64, self.connection_receive_bytes as u64);
-        check_range("connection_receive_bytes", receive_bytes, message_bytes, max_budget)?;
-        check_range("receive_bytes", self.receive_bytes as u64, receive_bytes, max_budget)?;
+        check_range("receive_bytes", self.receive_bytes as u64, 2 * self.message_bytes as u64, max_budget)?;
         // The largest reply has 3 MiB. Two fit, so that one unread reply does not block all others.
         let reply_bytes = self.connection_reply_bytes as u64;
         check_range("connection_reply_bytes", reply_bytes, 6 << 20, max_budget)?;
@@ -517,7 +511,7 @@ mod tests {
         let invalid_configs: [(&str, Config); 8] = [
             ("config.listen", Config { listen: Vec::new(), ..Config::default() }),
             ("config.receive_bytes", Config { receive_bytes: 1 << 20, ..Config::default() }),
-            ("config.connection_receive_bytes", Config { message_bytes: 64 << 20, ..Config::default() }),
+            ("config.receive_bytes", Config { message_bytes: 128 << 20, ..Config::default() }),
             ("config.chunk_bytes", Config { chunk_bytes: 2 << 20, ..Config::default() }),
             ("config.window", Config { window: 300, ..Config::default() }),
             ("config.frame_side", Config { frame_side: 0, ..Config::default() }),

@@ -80,6 +80,16 @@ impl Limit {
         when_full: WhenFull::Preempt,
     };
 
+    /// Of messages that are not received completely, or not answered.
+    pub const RECEIVED_BYTES: &'static Self = &Self {
+        resource: "received_bytes",
+        objects: "bytes of requests that are being received",
+        option: Some("--receive-bytes"),
+        total: |config| config.receive_bytes,
+        reserve_divisor: 4,
+        when_full: WhenFull::Preempt,
+    };
+
     /// They count to the principal, whichever client it uploads with.
     pub const STORED_BYTES: &'static Self = &Self {
         resource: "stored_bytes",
@@ -92,12 +102,13 @@ impl Limit {
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 6] = [
+pub const LIMITS: [&Limit; 7] = [
     Limit::CONNECTIONS,
     Limit::SUBSCRIPTIONS,
     Limit::WAITING_REQUESTS,
     Limit::OPEN_SCENES,
     Limit::UPLOADS,
+    Limit::RECEIVED_BYTES,
     Limit::STORED_BYTES,
 ];
 

@@ -99,14 +99,11 @@ pub(super) struct Args {
     /// Largest accepted message, in bytes.
     #[arg(long, default_value_t = Config::default().message_bytes)]
     message_bytes: usize,
-    /// Limit on the messages that one connection is sending, in bytes. Default: 32 MiB, and at least the largest
+    /// Limit on the messages that all clients are sending, in bytes. A single client leaves a quarter for others. At the
+    /// limit, the client that holds the most loses its incomplete messages. Default: 128 MiB, and at least twice the largest
     /// message.
     #[arg(long)]
-    connection_receive_bytes: Option<usize>,
-    /// Limit on the messages that all connections are sending, in bytes. When it is exhausted, the connection that
-    /// holds the most loses its incomplete messages.
-    #[arg(long, default_value_t = Config::default().receive_bytes)]
-    receive_bytes: usize,
+    receive_bytes: Option<usize>,
     /// Longest time without progress of an incomplete message, in milliseconds.
     #[arg(long, default_value_t = default_ms(Config::default().message_timeout))]
     message_timeout_ms: u64,
@@ -209,10 +206,7 @@ impl Args {
             encode: self.encode,
             allow_software: !self.hardware_only,
             message_bytes: self.message_bytes,
-            connection_receive_bytes: self
-                .connection_receive_bytes
-                .unwrap_or_else(|| defaults.connection_receive_bytes.max(self.message_bytes)),
-            receive_bytes: self.receive_bytes,
+            receive_bytes: self.receive_bytes.unwrap_or_else(|| defaults.receive_bytes.max(2 * self.message_bytes)),
             message_timeout: Duration::from_millis(self.message_timeout_ms),
             connection_reply_bytes: self.connection_reply_bytes,
             reply_bytes: self.reply_bytes,

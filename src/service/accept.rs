@@ -27,7 +27,7 @@ use super::peer::Peer;
 use super::routes::Routes;
 use super::tls::TlsServer;
 use super::web::WebServer;
-use crate::admission::Account;
+use crate::admission::{Account, AdmissionMetrics};
 use crate::config::Config;
 
 /// Pause of the listener after a failed accept.
@@ -63,6 +63,7 @@ impl ConnectionServer {
         tls: Option<Arc<TlsServer>>,
         connections: ConnectionGauges,
         config: &Config,
+        metrics: &AdmissionMetrics,
     ) -> Arc<Self> {
         Arc::new(Self {
             routes,
@@ -71,7 +72,7 @@ impl ConnectionServer {
             connections,
             web,
             http2: http2_builder(config),
-            budgets: Budgets::new(config),
+            budgets: Budgets::new(config, metrics),
             handshake_timeout: config.handshake_timeout,
             first_request_timeout: config.first_request_timeout,
         })

@@ -9,7 +9,7 @@ use super::open_calls::OpenCalls;
 use super::peer::Peer;
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
-use crate::admission::{Account, Client, PermitHandle};
+use crate::admission::{Account, AdmissionMetrics, Client, PermitHandle};
 use crate::config::Config;
 use crate::identity::{Credential, Principal, TokenHash};
 use modalcast_model::error::{Error, Result, fault, fault_in};
@@ -34,9 +34,9 @@ pub(super) struct Budgets {
 }
 
 impl Budgets {
-    pub(super) fn new(config: &Config) -> Self {
+    pub(super) fn new(config: &Config, metrics: &AdmissionMetrics) -> Self {
         Self {
-            receive: ReceiveBudget::new(config),
+            receive: ReceiveBudget::new(config, metrics),
             reply: ReplyBudget::new(config),
             max_connection_pixels: config.connection_pixels,
         }
@@ -89,7 +89,7 @@ impl ConnectionInfo {
             frame_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
             stream_pixels: Arc::new(Semaphore::new(budgets.max_connection_pixels as usize)),
             max_pixels: budgets.max_connection_pixels,
-            receive: budgets.receive.new_connection(),
+            receive: budgets.receive.new_connection(&slot.permit().account()),
             reply: budgets.reply.new_connection(Arc::clone(&slot.close)),
             calls: Arc::clone(&slot.calls),
             permit: slot.permit().clone(),
@@ -102,9 +102,13 @@ impl ConnectionInfo {
         self.client = TokenHash::of(token).map_or(self.client, Client::Session);
     }
 
-    /// Counts the connection to the principal of a call, unless it counts to one already.
-    pub(super) fn identify(&self, principal: &Principal) {
-        self.permit.identify(|| self.account(principal));
+    /// The account of a call of a principal. Counts the connection to it, unless it counts to one already.
+    pub(super) fn identify(&self, principal: &Principal) -> Account {
+        let account = self.account(principal);
+        if self.permit.identify(|| account.clone()) {
+            self.receive.identify(|| account.clone());
+        }
+        account
     }
 
     /// The account of calls of a principal on this connection.

@@ -46,7 +46,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             client_scenes: Limit::OPEN_SCENES.of_client(config) as u32,
             client_upload_bytes: Limit::STORED_BYTES.of_client(config) as u64,
             drives: MAX_DRIVES as u32,
-            connection_receive_bytes: config.connection_receive_bytes as u64,
+            connection_receive_bytes: Limit::RECEIVED_BYTES.of_client(config) as u64,
             message_timeout_ms: to_ms(config.message_timeout),
             connection_reply_bytes: config.connection_reply_bytes as u64,
             reply_timeout_ms: to_ms(config.reply_timeout),

@@ -114,10 +114,11 @@ pub async fn serve(
         let admin_server = AdminServer::new(engine.clone(), is_serving, &connections, failures);
         admin_tasks.spawn(admin_server.accept_connections(sockets));
     }
+    let metrics = engine.admission_metrics();
     let connection_server =
-        ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config);
+        ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config, metrics);
     let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
-    let table = ConnectionTable::new(config.connections, engine.admission_metrics());
+    let table = ConnectionTable::new(config.connections, metrics);
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {

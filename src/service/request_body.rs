@@ -7,13 +7,12 @@ use std::task::{Context, Poll};
 
 use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
-use tokio::sync::futures::OwnedNotified;
 use tonic::Status;
 use tonic::body::Body;
 
 use super::open_calls::CountedCall;
 use super::progress_timer::ProgressTimer;
-use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, ReceivedMemory};
+use super::receive_budget::{ConnectionReceiveBudget, MessageLimits, Preemption, ReceivedMemory};
 use super::status::to_status;
 use modalcast_model::error::{Error, Result};
 
@@ -34,7 +33,15 @@ impl CallMemory {
         self.incomplete.is_in_use() || self.complete.as_ref().is_some_and(ReceivedMemory::is_in_use)
     }
 
-    /// Fails if memory in use was evicted.
+    /// Completes when the bytes that are in use now are lost.
+    fn preempted(&self) -> Preemption {
+        match &self.complete {
+            Some(complete) if !self.incomplete.is_in_use() => complete.preempted(),
+            _ => self.incomplete.preempted(),
+        }
+    }
+
+    /// Fails if memory in use was lost.
     fn check(&self) -> Result<()> {
         self.incomplete.check()?;
         self.complete.as_ref().map_or(Ok(()), ReceivedMemory::check)
@@ -69,7 +76,7 @@ pub(super) struct RequestBody {
     position: MessagePosition,
     limits: MessageLimits,
     timer: ProgressTimer,
-    eviction: Option<Pin<Box<OwnedNotified>>>,
+    preemption: Option<Preemption>,
     call: Arc<CountedCall>,
 }
 
@@ -81,7 +88,7 @@ impl RequestBody {
             position: MessagePosition::default(),
             limits,
             timer: ProgressTimer::new(limits.timeout),
-            eviction: None,
+            preemption: None,
             call,
         }
     }
@@ -105,21 +112,21 @@ impl RequestBody {
         incomplete.resize(self.position.incomplete_bytes().min(self.limits.max_bytes))
     }
 
-    /// Waits for more bytes. Ready when the messages of the call were evicted, or the rest of a message is overdue.
+    /// Waits for more bytes. Ready when the messages of the call were lost, or the rest of a message is overdue.
     fn poll_wait(&mut self, cx: &mut Context<'_>) -> Poll<Error> {
         if !self.memory.lock().is_in_use() && !self.position.is_incomplete() {
             return Poll::Pending;
         }
-        // Register before the check, so that an eviction between the two wakes this task.
-        loop {
-            let new_eviction = || Box::pin(self.memory.lock().incomplete.next_eviction());
-            if self.eviction.get_or_insert_with(new_eviction).as_mut().poll(cx).is_pending() {
+        while self.memory.lock().is_in_use() {
+            let new_preemption = || self.memory.lock().preempted();
+            if self.preemption.get_or_insert_with(new_preemption).as_mut().poll(cx).is_pending() {
                 break;
             }
-            self.eviction = None;
-        }
-        if let Err(error) = self.memory.lock().check() {
-            return Poll::Ready(error);
+            // That of an earlier message, unless the check fails.
+            self.preemption = None;
+            if let Err(error) = self.memory.lock().check() {
+                return Poll::Ready(error);
+            }
         }
         if !self.position.is_incomplete() {
             return Poll::Pending;
@@ -221,7 +228,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::admission::{Limit, Permit};
+    use crate::admission::{Account, AdmissionMetrics, Client, Limit, Permit};
     use crate::config::Config;
     use crate::service::receive_budget::ReceiveBudget;
 
@@ -277,9 +284,17 @@ mod tests {
         (RequestBody::new(Body::new(ChannelBody(receiver)), memory, limits, call), sender)
     }
 
+    /// A budget of which one client may hold 600 bytes.
+    fn budget() -> Arc<ReceiveBudget> {
+        ReceiveBudget::new(&Config { receive_bytes: 800, ..Config::default() }, &AdmissionMetrics::default())
+    }
+
+    fn account(client: u64) -> Account {
+        Account { principal: Some("anna".into()), client: Client::Connection(client) }
+    }
+
     fn connection() -> Arc<ConnectionReceiveBudget> {
-        let config = Config { receive_bytes: 1000, connection_receive_bytes: 600, ..Config::default() };
-        ReceiveBudget::new(&config).new_connection()
+        budget().new_connection(&account(1))
     }
 
     #[tokio::test]
@@ -331,10 +346,9 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn message_over_budget_is_rejected_and_eviction_ends_a_wait() {
-        let budget =
-            ReceiveBudget::new(&Config { receive_bytes: 1000, connection_receive_bytes: 600, ..Config::default() });
-        let connection = budget.new_connection();
+    async fn message_over_budget_is_rejected_and_preemption_ends_a_wait() {
+        let budget = budget();
+        let connection = budget.new_connection(&account(1));
         let (mut body, frames) = body_of(&connection, Duration::from_secs(1000));
         frames.send(encode(&[590])[..100].to_vec()).await.expect("expected an open channel");
         next_frame(&mut body).await.expect("a frame").expect("no error");
@@ -344,13 +358,13 @@ mod tests {
         assert_eq!(status.code(), tonic::Code::ResourceExhausted);
         let evict = async {
             tokio::task::yield_now().await;
-            let other = budget.new_connection();
+            let other = budget.new_connection(&account(2));
             let mut memory = other.new_memory();
-            memory.resize(500).expect("expected the first connection to be evicted");
+            memory.resize(500).expect("expected the first connection to lose its bytes");
             memory
         };
         let (end, _memory) = tokio::join!(next_frame(&mut body), evict);
-        let status = end.expect("a result").expect_err("expected an eviction");
+        let status = end.expect("a result").expect_err("expected a preemption");
         assert_eq!(status.code(), tonic::Code::ResourceExhausted);
     }
 }

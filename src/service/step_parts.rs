@@ -49,7 +49,7 @@ impl StepAssembler {
     ///
     /// # Errors
     /// `Invalid` for a part of another step, a step that is too large or a wrong range of shared memory; `LimitReached`
-    /// or `Busy` when the parts exceed a budget. The parts of the step are dropped.
+    /// or `Preempted` when the client holds its share of the bytes. The parts of the step are dropped.
     pub(super) fn push(&mut self, mut part: v1::Step) -> Result<Option<v1::Step>> {
         // The values in shared memory count like those of several messages.
         let is_one_message = !part.has_more && part.shared_q.is_none() && part.shared_transforms.is_none();
@@ -125,12 +125,12 @@ impl StepAssembler {
         self.memory.resize(0).ok();
     }
 
-    /// Waits until the parts of an incomplete step are evicted or the next part is overdue. Pends forever without an
+    /// Waits until the parts of an incomplete step are lost to another client or the next part is overdue. Pends forever without an
     /// incomplete step. Cancel-safe.
     pub(super) async fn stalled(&self) -> Error {
         let State::Assembling(partial) = &self.state else { return std::future::pending().await };
         tokio::select! {
-            error = self.memory.evicted() => error,
+            error = self.memory.preempted() => error,
             () = tokio::time::sleep_until(partial.deadline) => Error::Deadline {
                 what: "the next part of a step".into(),
                 ms: self.limits.timeout.as_millis() as u64,
@@ -144,11 +144,13 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+    use crate::admission::{Account, AdmissionMetrics};
     use crate::config::Config;
     use crate::service::receive_budget::ReceiveBudget;
 
     fn assembler(config: &Config) -> StepAssembler {
-        let connection = ReceiveBudget::new(config).new_connection();
+        let budget = ReceiveBudget::new(config, &AdmissionMetrics::default());
+        let connection = budget.new_connection(&Account::server());
         StepAssembler::new(connection.new_memory(), connection.limits(), CallMemory::default())
     }
 

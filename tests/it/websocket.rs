@@ -462,10 +462,10 @@ async fn incomplete_messages_and_silent_clients_are_disconnected() {
 /// Half-sent messages of many connections are bounded by the budget of all connections.
 #[tokio::test(flavor = "multi_thread")]
 async fn half_sent_messages_count_against_the_receive_budget() {
-    let limits = |config| Config { connection_receive_bytes: 1 << 20, receive_bytes: 3 << 19, ..config };
+    let limits = |config| Config { receive_bytes: 2 << 20, ..config };
     let server = Server::start_with(limits).await;
     let mut clients = Vec::new();
-    for bytes in [1000 << 10, 500 << 10] {
+    for bytes in [1000 << 10, 760 << 10] {
         let mut client = WebSocketClient::connect(&server).await;
         client.stream.send(fragment(Data::Binary, &vec![0; bytes], false)).await.expect("expected an open connection");
         clients.push(client);

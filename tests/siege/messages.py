@@ -28,7 +28,7 @@ MAX_SERVICE_SECONDS = 1.0
 MESSAGE_TIMEOUT = 10
 
 # Flags that raise the budgets to their largest values.
-UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
+UNLIMITED = ["--receive-bytes", "4000000000"]
 
 
 def send_half(connection):

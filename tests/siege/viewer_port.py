@@ -44,7 +44,7 @@ MAX_UNREAD_MEMORY = 384 << 20
 DURATION = 12.0
 
 # Flags that raise the budgets to their largest values.
-UNLIMITED = ["--connection-receive-bytes", "4000000000", "--receive-bytes", "4000000000"]
+UNLIMITED = ["--receive-bytes", "4000000000"]
 UNLIMITED += ["--connection-reply-bytes", "4000000000", "--reply-bytes", "4000000000"]
 
 

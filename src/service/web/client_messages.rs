@@ -224,11 +224,13 @@ mod tests {
 
     use super::super::super::receive_budget::ReceiveBudget;
     use super::*;
+    use crate::admission::{Account, AdmissionMetrics};
     use crate::config::Config;
 
     fn messages() -> Arc<ClientMessages> {
-        let config = Config { connection_receive_bytes: 3 << 20, ..Config::default() };
-        ClientMessages::new(&ReceiveBudget::new(&config).new_connection())
+        let config = Config { receive_bytes: 4 << 20, ..Config::default() };
+        let budget = ReceiveBudget::new(&config, &AdmissionMetrics::default());
+        ClientMessages::new(&budget.new_connection(&Account::server()))
     }
 
     /// The bytes of a gRPC message.

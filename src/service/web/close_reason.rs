@@ -63,15 +63,10 @@ impl CloseReason {
         Self::new(4002, "expected credit for a message, got none")
     }
 
-    /// A receive budget is exhausted.
+    /// The client holds its share of the bytes that are being received, or has lost them to another client.
     pub(super) fn receive_budget(error: &Error) -> Self {
-        let code = if matches!(error, Error::Busy { .. }) { 1013 } else { 1008 };
+        let code = if matches!(error, Error::Preempted { .. }) { 1013 } else { 1008 };
         Self::new(code, error.to_string())
-    }
-
-    /// The connection's messages were dropped to free memory for another connection.
-    pub(super) fn evicted() -> Self {
-        Self::new(1013, "the messages of all connections exceed their limit")
     }
 
     /// The reason of a failed read. `None` if the connection is lost.

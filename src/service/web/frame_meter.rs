@@ -202,6 +202,7 @@ mod tests {
 
     use super::super::super::receive_budget::ReceiveBudget;
     use super::*;
+    use crate::admission::{Account, AdmissionMetrics};
     use crate::config::Config;
 
     const BINARY: u8 = 2;
@@ -221,9 +222,13 @@ mod tests {
         bytes
     }
 
+    fn connection_of(config: &Config) -> Arc<ConnectionReceiveBudget> {
+        ReceiveBudget::new(config, &AdmissionMetrics::default()).new_connection(&Account::server())
+    }
+
     fn budget() -> Arc<ConnectionReceiveBudget> {
-        let config = Config { connection_receive_bytes: 150_000, message_bytes: 100_000, ..Config::default() };
-        ReceiveBudget::new(&config).new_connection()
+        let config = Config { receive_bytes: 200_000, message_bytes: 100_000, ..Config::default() };
+        connection_of(&config)
     }
 
     fn meter_within(budget: &Arc<ConnectionReceiveBudget>) -> FrameMeter {
@@ -320,7 +325,7 @@ mod tests {
     #[tokio::test]
     async fn only_an_incomplete_message_has_a_deadline() {
         let config = Config { message_timeout: Duration::from_millis(20), ..Config::default() };
-        let budget = ReceiveBudget::new(&config).new_connection();
+        let budget = connection_of(&config);
         let mut meter = FrameMeter::new(&budget, Arc::default());
         let overdue = async |meter: &mut FrameMeter, limit| {
             tokio::time::timeout(limit, std::future::poll_fn(|cx| meter.poll_overdue(cx))).await

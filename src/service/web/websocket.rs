@@ -132,7 +132,7 @@ pub(super) async fn serve_websocket(
     if meter.receive(&first_bytes).is_err() {
         return;
     }
-    let evicted = info.receive.new_memory().next_eviction();
+    let preempted = info.receive.preempted();
     let (read_half, write_half) = tokio::io::split(socket);
     let read_socket = MeteredSocket::new(tokio::io::join(read_half, tokio::io::sink()), first_bytes, meter);
     let mut reader = Reader::new(read_socket, limits.library_settings()).await;
@@ -147,7 +147,7 @@ pub(super) async fn serve_websocket(
             reason = calls.serve(&mut reader, slot, limits.first_request_timeout) => reason,
             _ = &mut write => None,
             () = keep_alive => None,
-            () = evicted => Some(CloseReason::evicted()),
+            error = preempted => Some(CloseReason::receive_budget(&error)),
         };
         if reason == Some(CloseReason::going_away()) {
             // Write the last messages of the calls.
