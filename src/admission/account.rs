@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::identity::{Principal, TokenHash};
 
 /// A holder of permits: a client of a principal.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Account {
     /// The name of the principal. `None` while the client is anonymous: none of its calls was admitted with a credential.
     pub principal: Option<Arc<str>>,

@@ -10,6 +10,8 @@ pub enum WhenFull {
     /// The client is refused. Of what one client leaves for others, this much is for principals that hold less, and the
     /// rest for clients that hold nothing.
     Refuse { minimum: usize },
+    /// The client waits, and gets what is returned before clients that hold more.
+    Wait,
 }
 
 /// A resource that is limited in number or in bytes.
@@ -90,6 +92,35 @@ impl Limit {
         when_full: WhenFull::Preempt,
     };
 
+    /// Of messages that HTTP/2 has not sent.
+    pub const REPLY_BYTES: &'static Self = &Self {
+        resource: "reply_bytes",
+        objects: "bytes of replies that are being sent",
+        option: Some("--reply-bytes"),
+        total: |config| config.reply_bytes,
+        reserve_divisor: 8,
+        when_full: WhenFull::Wait,
+    };
+
+    /// Built-in scenes do not wait for slow files.
+    pub const LOADS: &'static Self = &Self {
+        resource: "loads",
+        objects: "scenes that are being read",
+        option: None,
+        total: |_| 3,
+        reserve_divisor: 3,
+        when_full: WhenFull::Wait,
+    };
+
+    pub const BUILT_IN_LOADS: &'static Self = &Self {
+        resource: "built_in_loads",
+        objects: "built-in scenes that are being created",
+        option: None,
+        total: |_| 1,
+        reserve_divisor: 2,
+        when_full: WhenFull::Wait,
+    };
+
     /// They count to the principal, whichever client it uploads with.
     pub const STORED_BYTES: &'static Self = &Self {
         resource: "stored_bytes",
@@ -102,13 +133,16 @@ impl Limit {
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 7] = [
+pub const LIMITS: [&Limit; 10] = [
     Limit::CONNECTIONS,
     Limit::SUBSCRIPTIONS,
     Limit::WAITING_REQUESTS,
     Limit::OPEN_SCENES,
     Limit::UPLOADS,
     Limit::RECEIVED_BYTES,
+    Limit::REPLY_BYTES,
+    Limit::LOADS,
+    Limit::BUILT_IN_LOADS,
     Limit::STORED_BYTES,
 ];
 
@@ -129,6 +163,7 @@ mod tests {
             };
             let option = limit.option.map_or_else(String::new, |option| format!("`{option}`"));
             let when_full = match limit.when_full {
+                WhenFull::Wait => "waits; who holds the least is next".to_owned(),
                 WhenFull::Preempt => "the one with the least progress ends".to_owned(),
                 WhenFull::Refuse { minimum } => format!("refused; {} for a principal without any", shown(minimum)),
             };

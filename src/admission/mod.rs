@@ -5,6 +5,8 @@
 //! everybody gets one, but a single client leaves a part for others. When none is free, a client that holds fewer than
 //! another one gets a permit: the one with the least progress of the client that holds the most is preempted, which ends
 //! what it was granted for. Without a preemptible permit, or for a client that already has its share, it is refused.
+//!
+//! For resources that are returned soon, such as the bytes of replies, clients wait in a [`Queue`] instead.
 
 mod account;
 mod grant;
@@ -12,9 +14,11 @@ mod limits;
 mod metrics;
 mod permit;
 mod progress;
+mod queue;
 mod sharing;
 
 pub use account::{Account, Client};
 pub use limits::{LIMITS, Limit, WhenFull};
 pub use metrics::AdmissionMetrics;
 pub use permit::{Permit, PermitHandle, PermitPool};
+pub use queue::{Queue, QueueMember, Units};

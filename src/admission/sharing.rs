@@ -114,6 +114,8 @@ impl Holders {
                 let victims = self.find_for(account, amount, amount - free, share);
                 if victims.is_empty() { Decision::Refuse } else { Decision::Preempt(victims) }
             }
+            // Resources for which clients wait have a `Queue`, not a pool.
+            WhenFull::Wait => Decision::Refuse,
             WhenFull::Refuse { minimum } => {
                 let of_principal = self.principals.get(&account.principal).map_or(0, |principal| principal.amount);
                 let Some(left) = free.checked_sub(amount) else { return Decision::Refuse };

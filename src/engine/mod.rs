@@ -24,7 +24,6 @@ mod crash_signals;
 #[cfg(test)]
 mod crash_tests;
 mod device;
-mod load_permits;
 mod lock;
 mod memory_limits;
 mod output;
@@ -91,7 +90,6 @@ use tokio::sync::watch;
 
 use self::device::handle::DeviceThread;
 use self::device::work_owners::WorkOwners;
-use self::load_permits::LoadPermits;
 pub(crate) use self::lock::lock;
 use self::registry::Registry;
 use self::scene::actor::SceneServices;
@@ -105,7 +103,7 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_permits::{UploadPermit, UploadPermits};
-use crate::admission::{Account, AdmissionMetrics, Client, Limit};
+use crate::admission::{Account, AdmissionMetrics, Client, Limit, Queue};
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
@@ -126,7 +124,8 @@ struct Shared {
     memory: MemoryBudgets,
     registry: Registry,
     frame_streams: Arc<FrameStreamRegistry>,
-    load_permits: LoadPermits,
+    loads: Queue,
+    built_in_loads: Queue,
     upload_permits: Arc<UploadPermits>,
     /// Whether every scene of the last run is open or has failed.
     are_scenes_reopened: watch::Sender<bool>,
@@ -194,6 +193,7 @@ impl Engine {
         for upload in stored_uploads {
             upload_permits.store(&upload.scene, Some(upload.owner.into()), upload.bytes);
         }
+        let [loads, built_in_loads] = [Limit::LOADS, Limit::BUILT_IN_LOADS].map(|limit| Queue::new(limit, &config));
         let shared = Shared {
             services: SceneServices {
                 device: handle,
@@ -210,7 +210,8 @@ impl Engine {
             info,
             encoder: FrameEncoder::per_core()?,
             vertex_packer: VertexPacker::start()?,
-            load_permits: LoadPermits::new(),
+            loads,
+            built_in_loads,
             upload_permits,
             are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),

@@ -52,6 +52,7 @@ pub struct FailedScene {
 pub(super) struct RegistryEntry {
     provenance: SceneProvenance,
     access: SharedAccess,
+    account: Account,
     /// `None` for the first scene of each built-in source, which does not count.
     _permit: Option<Permit>,
     /// Empty until the scene is loaded.
@@ -87,6 +88,11 @@ impl RegistryEntry {
 
     pub(super) const fn access(&self) -> &SharedAccess {
         &self.access
+    }
+
+    /// What the scene counts to.
+    pub(super) const fn account(&self) -> &Account {
+        &self.account
     }
 
     /// The scene; `None` while it is not loaded.
@@ -143,6 +149,7 @@ impl Registry {
         let entry = Arc::new(RegistryEntry {
             provenance: provenance.clone(),
             access: Arc::new(watch::Sender::new(access.clone())),
+            account: account.clone(),
             _permit: permit,
             cell: OnceCell::new(),
             open_calls: AtomicUsize::new(1),

@@ -15,7 +15,7 @@ use super::scene_memory::SceneMemory;
 use super::source::StoredUpload;
 use super::storage::provenance::SceneProvenance;
 use super::storage::scene_catalog::folder_bytes;
-use super::storage::scene_record::{SceneAccess, SceneRecord, SharedAccess};
+use super::storage::scene_record::{SceneAccess, SceneRecord};
 use super::storage::upload::CompleteUpload;
 use super::storage::upload_record::read_hashes;
 use super::{Engine, scene_not_open};
@@ -62,7 +62,7 @@ impl Engine {
             Ok(entry) => {
                 let open = async || {
                     self.check_running()?;
-                    self.open_or_discard(name.to_owned(), record.provenance.clone(), entry.access(), None).await
+                    self.open_or_discard(name.to_owned(), record.provenance.clone(), &entry, None).await
                 };
                 let opened = entry.get_or_open(open).await;
                 // `end_opening` records the failure of a loaded scene. The failure of an opening is recorded before the
@@ -134,8 +134,7 @@ impl Engine {
         provenance: SceneProvenance,
         upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
-        let access = entry.access();
-        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, access, upload)).await;
+        let opened = entry.get_or_open(|| self.open_or_discard(name.clone(), provenance, entry, upload)).await;
         self.end_opening(&name, entry);
         opened
     }
@@ -156,11 +155,11 @@ impl Engine {
         &self,
         name: String,
         provenance: SceneProvenance,
-        access: &SharedAccess,
+        entry: &RegistryEntry,
         upload: Option<CompleteUpload>,
     ) -> Result<Arc<SceneHandle>> {
         let is_new_upload = upload.is_some();
-        let result = self.load_scene(&name, &provenance, access, upload).await;
+        let result = self.load_scene(&name, &provenance, entry, upload).await;
         if result.is_err() && is_new_upload {
             let engine = self.clone();
             let remove = move || {
@@ -178,11 +177,17 @@ impl Engine {
         &self,
         name: &str,
         provenance: &SceneProvenance,
-        access: &SharedAccess,
+        entry: &RegistryEntry,
         upload: Option<CompleteUpload>,
     ) -> Result<SceneHandle> {
+        let access = entry.access();
         let memory = self.shared.memory.new_scene(&access.borrow().owner);
+        let is_built_in =
+            matches!(provenance, SceneProvenance::Repository { source } if self.shared.source.is_built_in(source));
+        let loads = if is_built_in { &self.shared.built_in_loads } else { &self.shared.loads };
+        let turn = loads.member(entry.account()).acquire(1).await?;
         let OpenedScene { scene, backends } = self.read_scene_files(name, provenance, upload, &memory).await?;
+        drop(turn);
         memory.reserve_loaded(name, &scene)?;
         let (engine, scene_name, shared_scene) = (self.clone(), name.to_owned(), Arc::clone(&scene));
         let restored_state =
@@ -253,9 +258,6 @@ impl Engine {
     ) -> Result<OpenedScene> {
         let memory = Arc::clone(&memory.host);
         let source = Arc::clone(&self.shared.source);
-        let is_built_in =
-            matches!(provenance, SceneProvenance::Repository { source: path } if source.is_built_in(path));
-        let _permit = self.shared.load_permits.acquire(is_built_in).await?;
         let upload_folder = self.shared.scene_catalog.upload_folder(name);
         let (engine, scene_name, provenance) = (self.clone(), name.to_owned(), provenance.clone());
         let read = move || match provenance {

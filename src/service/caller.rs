@@ -15,6 +15,8 @@ use crate::identity::{Credential, Principal};
 pub(super) struct AdmittedCall {
     /// `None` for a method that requires none.
     pub(super) credential: Option<Arc<Credential>>,
+    /// What the permits of the call count to.
+    pub(super) account: Account,
     pub(super) replies: Arc<CallReplies>,
 }
 
@@ -23,7 +25,6 @@ pub(super) struct AdmittedCall {
 pub(super) struct Caller {
     pub(super) principal: Arc<Principal>,
     pub(super) credential: Arc<Credential>,
-    /// What the permits of the call count to.
     pub(super) account: Account,
     /// Counts the replies of the call.
     pub(super) replies: Arc<CallReplies>,
@@ -36,11 +37,12 @@ impl Caller {
     /// `INTERNAL` for a request that was not admitted with a credential.
     pub(super) fn of<T>(request: &Request<T>) -> Result<Self, Status> {
         let call = request.extensions().get::<AdmittedCall>().cloned();
-        let AdmittedCall { credential, replies } = call.ok_or_else(|| internal_fault("expected an admitted call"))?;
+        let AdmittedCall { credential, account, replies } =
+            call.ok_or_else(|| internal_fault("expected an admitted call"))?;
         let credential = credential.ok_or_else(|| internal_fault("expected a call with a credential"))?;
         let connection = ConnectionInfo::of(request).map_err(to_status)?;
         let principal = Arc::clone(credential.principal());
-        let (account, peer) = (connection.account(&principal), connection.peer().to_owned());
+        let peer = connection.peer().to_owned();
         Ok(Self { principal, credential, account, replies, peer })
     }
 

@@ -112,7 +112,7 @@ impl ConnectionInfo {
     }
 
     /// The account of calls of a principal on this connection.
-    pub(super) fn account(&self, principal: &Principal) -> Account {
+    fn account(&self, principal: &Principal) -> Account {
         Account::new(principal, self.client)
     }
 

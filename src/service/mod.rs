@@ -11,7 +11,6 @@ mod connection_table;
 mod control_frames;
 mod convert;
 mod describe;
-mod fair_bytes;
 mod forces;
 mod frame_allowance;
 mod frames;

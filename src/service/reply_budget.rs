@@ -1,7 +1,7 @@
 //! Budgets for the bytes of replies that are produced and not yet sent, per connection and in total.
 //!
 //! A message counts from the moment when it is queued until HTTP/2 has written its last byte to the socket. A sender
-//! without budget waits; the connection that holds the fewest bytes is the first to continue. The wait is bounded: a
+//! without budget waits; the client that holds the fewest bytes is the first to continue ([`Limit::REPLY_BYTES`]). The wait is bounded: a
 //! call whose client takes no bytes for the reply timeout ends as soon as another sender waits for the same budget. If
 //! that does not free the bytes, the connection is closed. If the total is exhausted, a connection that holds more than
 //! its share and takes nothing for a shorter time is closed, so that a few connections do not delay all others.
@@ -19,9 +19,9 @@ use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 use tonic::Status;
 use tonic::body::Body;
 
-use super::fair_bytes::{ByteGrant, ByteHolder, FairBytes};
 use super::open_calls::CountedCall;
-use super::status::internal_fault;
+use super::status::{internal_fault, to_status};
+use crate::admission::{Account, Limit, Queue, QueueMember, Units};
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::Error;
@@ -43,7 +43,7 @@ const MIN_SHARE: usize = 4 << 20;
 /// The budget of all connections.
 #[derive(Debug)]
 pub(super) struct ReplyBudget {
-    bytes: Arc<FairBytes>,
+    bytes: Queue,
     max_connection_bytes: usize,
     /// Time without progress after which a call may be ended.
     reply_timeout: Duration,
@@ -56,8 +56,6 @@ pub(super) struct ConnectionReplyBudget {
     total: Arc<ReplyBudget>,
     /// Key in `ReplyBudget::connections`.
     id: u64,
-    /// What the connection holds of the total.
-    of_total: Arc<ByteHolder>,
     /// The budget of the connection.
     permits: Arc<Semaphore>,
     max_bytes: usize,
@@ -73,6 +71,8 @@ pub(super) struct ConnectionReplyBudget {
 #[derive(Debug)]
 pub(super) struct CallReplies {
     connection: Arc<ConnectionReplyBudget>,
+    /// The place of the client among those that wait for the total.
+    of_total: QueueMember,
     /// Key in `ConnectionReplyBudget::calls`.
     id: u64,
     progress: Mutex<Progress>,
@@ -122,7 +122,7 @@ pub(super) struct UnsentBytes {
     /// Whether the bytes are part of a frame of the response. Others are dropped without being sent.
     is_attached: bool,
     /// What these bytes take from the budget of all connections.
-    of_total: ByteGrant,
+    of_total: Units,
 }
 
 /// All existing objects of a kind.
@@ -177,7 +177,7 @@ async fn search_while_waiting<T>(acquire: impl Future<Output = T>, interval: Dur
 impl ReplyBudget {
     pub(super) fn new(config: &Config) -> Arc<Self> {
         Arc::new(Self {
-            bytes: FairBytes::new(config.reply_bytes),
+            bytes: Queue::new(Limit::REPLY_BYTES, config),
             max_connection_bytes: config.connection_reply_bytes,
             reply_timeout: config.reply_timeout,
             connections: Registry::new(),
@@ -190,7 +190,6 @@ impl ReplyBudget {
         self.connections.insert(|id| ConnectionReplyBudget {
             total: Arc::clone(self),
             id,
-            of_total: self.bytes.new_holder(),
             permits: Arc::new(Semaphore::new(max_bytes)),
             max_bytes,
             turn: tokio::sync::Mutex::default(),
@@ -214,7 +213,7 @@ impl ReplyBudget {
     fn relieve(&self) {
         let connections = self.connections.search(self.total_search_interval() / 2);
         let loads: Vec<_> = connections.iter().map(|connection| *lock(&connection.progress)).collect();
-        for index in find_connections_above_share(&loads, self.bytes.max_bytes(), EVICTION_STALL) {
+        for index in find_connections_above_share(&loads, self.bytes.total(), EVICTION_STALL) {
             let unsent_bytes = loads[index].unsent_bytes;
             tracing::warn!(
                 unsent_bytes,
@@ -245,11 +244,12 @@ fn find_connections_above_share(loads: &[Progress], max_bytes: usize, stall: Dur
 }
 
 impl ConnectionReplyBudget {
-    /// The replies of a new call.
-    pub(super) fn new_call(self: &Arc<Self>) -> Arc<CallReplies> {
-        let connection = Arc::clone(self);
+    /// The replies of a new call, which count to an account.
+    pub(super) fn new_call(self: &Arc<Self>, account: &Account) -> Arc<CallReplies> {
+        let (connection, of_total) = (Arc::clone(self), self.total.bytes.member(account));
         let (progress, ended) = (Mutex::new(Progress::new()), Notify::new());
-        self.calls.insert(|id| CallReplies { connection, id, progress, ended, is_ended: AtomicBool::new(false) })
+        let is_ended = AtomicBool::new(false);
+        self.calls.insert(|id| CallReplies { connection, of_total, id, progress, ended, is_ended })
     }
 
     /// Ends the stalled calls of this connection, unless they were searched less than `interval` ago.
@@ -281,8 +281,9 @@ impl CallReplies {
             .await
             .map_err(|_| internal_fault("the reply budget is closed"))?;
         let turn = connection.turn.lock().await;
-        let of_total = connection.of_total.acquire(permits);
-        let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await?;
+        let of_total = self.of_total.acquire(permits);
+        let of_total = search_while_waiting(of_total, total.total_search_interval(), || total.relieve()).await;
+        let of_total = of_total.map_err(to_status)?;
         drop(turn);
         self.each_progress(|progress| progress.produce(bytes));
         Ok(UnsentBytes { call: Arc::clone(self), bytes, of_connection, is_attached: false, of_total })
@@ -383,7 +384,7 @@ impl UnsentBytes {
 
     /// Removes what `bytes` take from the budgets. A message above the budget of its connection has fewer permits than
     /// bytes; the remainder keeps the rest.
-    fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, ByteGrant)> {
+    fn split_permits(&mut self, bytes: usize) -> Option<(OwnedSemaphorePermit, Units)> {
         let of_connection = self.of_connection.split(bytes.min(self.of_connection.num_permits()))?;
         Some((of_connection, self.of_total.split(bytes)))
     }
@@ -452,13 +453,14 @@ impl HttpBody for CountedReplyBody {
 impl CallReplies {
     /// The replies of a call of a connection of its own, with the default budgets.
     pub(super) fn with_default_budgets() -> Arc<Self> {
-        ReplyBudget::new(&Config::default()).new_connection(Arc::default()).new_call()
+        ReplyBudget::new(&Config::default()).new_connection(Arc::default()).new_call(&Account::server())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::admission::Client;
 
     /// A total of 100 bytes, of which one connection may hold 60.
     fn small_budget() -> Arc<ReplyBudget> {
@@ -470,6 +472,10 @@ mod tests {
         })
     }
 
+    fn account(client: u64) -> Account {
+        Account { principal: Some("anna".into()), client: Client::Connection(client) }
+    }
+
     async fn with_timeout<T>(work: impl Future<Output = T>) -> T {
         tokio::time::timeout(crate::hang_guard::HANG_GUARD, work).await.expect("expected completion")
     }
@@ -477,7 +483,7 @@ mod tests {
     #[tokio::test]
     async fn bytes_count_until_their_frame_is_dropped() {
         let budget = small_budget();
-        let call = budget.new_connection(Arc::default()).new_call();
+        let call = budget.new_connection(Arc::default()).new_call(&Account::server());
         // A frame of two messages, of which one needs less than was reserved.
         let mut unsent = Vec::new();
         for (reserved_bytes, bytes) in [(20, 20), (40, 30)] {
@@ -485,7 +491,7 @@ mod tests {
             of_message.shrink_to(bytes);
             unsent.push(of_message);
         }
-        let free_bytes = || budget.bytes.free_bytes();
+        let free_bytes = || budget.bytes.free();
         assert_eq!(free_bytes(), 50);
         let frame = count_until_sent(vec![0; 50].into(), unsent);
         let uncounted = count_until_sent(vec![0; 5].into(), vec![]);
@@ -501,12 +507,12 @@ mod tests {
     #[tokio::test]
     async fn message_above_the_budget_passes_alone() {
         let budget = small_budget();
-        let call = budget.new_connection(Arc::default()).new_call();
-        let other_call = budget.new_connection(Arc::default()).new_call();
+        let call = budget.new_connection(Arc::default()).new_call(&account(1));
+        let other_call = budget.new_connection(Arc::default()).new_call(&account(2));
         let large = with_timeout(call.acquire(1000)).await.expect("expected capacity");
         let other = with_timeout(other_call.acquire(40)).await.expect("expected capacity");
         drop((large, other));
-        assert_eq!(budget.bytes.free_bytes(), 100);
+        assert_eq!(budget.bytes.free(), 100);
     }
 
     #[test]
@@ -534,12 +540,12 @@ mod tests {
         let budget = small_budget();
         let close = Arc::new(Notify::new());
         let stalled_connection = budget.new_connection(Arc::clone(&close));
-        let stalled = stalled_connection.new_call();
+        let stalled = stalled_connection.new_call(&account(1));
         let held = stalled.acquire(60).await.expect("expected capacity");
         // Nobody waits, so the call does not end.
         let end = tokio::time::timeout(Duration::from_millis(200), stalled.ended()).await;
         assert!(end.is_err(), "expected no end while nobody waits");
-        let other = budget.new_connection(Arc::default()).new_call();
+        let other = budget.new_connection(Arc::default()).new_call(&account(2));
         let waiting = tokio::spawn(async move { other.acquire(60).await.map(drop) });
         with_timeout(stalled.ended()).await;
         with_timeout(close.notified()).await;
@@ -553,7 +559,7 @@ mod tests {
         let budget = small_budget();
         let close = Arc::new(Notify::new());
         let connection = budget.new_connection(Arc::clone(&close));
-        let calls = [connection.new_call(), connection.new_call()];
+        let calls = [connection.new_call(&account(1)), connection.new_call(&account(1))];
         let _stalled_bytes = calls[0].acquire(20).await.expect("expected capacity");
         end_stalled(&calls, Duration::ZERO, None);
         assert!(calls[0].is_ended());
@@ -575,7 +581,7 @@ mod tests {
         let limit = Duration::from_secs(50);
         let close = Arc::new(Notify::new());
         let connection = small_budget().new_connection(Arc::clone(&close));
-        let calls = [connection.new_call(), connection.new_call()];
+        let calls = [connection.new_call(&account(1)), connection.new_call(&account(1))];
         let _first_bytes = calls[0].acquire(20).await.expect("expected capacity");
         let _second_bytes = calls[1].acquire(20).await.expect("expected capacity");
         end_stalled(&calls, Duration::ZERO, None);
@@ -592,9 +598,9 @@ mod tests {
     #[tokio::test]
     async fn only_sent_bytes_are_progress_of_a_connection() {
         let connection = small_budget().new_connection(Arc::default());
-        let first = connection.new_call().acquire(20).await.expect("expected capacity");
+        let first = connection.new_call(&account(1)).acquire(20).await.expect("expected capacity");
         let first_change = lock(&connection.progress).last_change;
-        let mut second = connection.new_call().acquire(30).await.expect("expected capacity");
+        let mut second = connection.new_call(&account(1)).acquire(30).await.expect("expected capacity");
         second.shrink_to(10);
         let progress = *lock(&connection.progress);
         assert_eq!((progress.unsent_bytes, progress.last_change), (30, first_change));
@@ -606,7 +612,7 @@ mod tests {
 
     #[tokio::test]
     async fn only_a_call_without_progress_is_stalled() {
-        let call = small_budget().new_connection(Arc::default()).new_call();
+        let call = small_budget().new_connection(Arc::default()).new_call(&Account::server());
         let calls = [Arc::clone(&call)];
         let is_ended = || call.is_ended();
         end_stalled(&calls, Duration::ZERO, None);

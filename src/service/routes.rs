@@ -88,11 +88,12 @@ impl Routes {
                 });
             }
         };
-        if let Some(credential) = &credential {
-            connection.identify(credential.principal());
-        }
-        let replies = connection.reply.new_call();
-        request.extensions_mut().insert(AdmittedCall { credential: credential.clone(), replies });
+        let account = match &credential {
+            Some(credential) => connection.identify(credential.principal()),
+            None => connection.permit.account(),
+        };
+        let replies = connection.reply.new_call(&account);
+        request.extensions_mut().insert(AdmittedCall { credential: credential.clone(), account, replies });
         let timeout = request.headers().get("grpc-timeout");
         let timeout = timeout.and_then(|timeout| parse_timeout(timeout.to_str().ok()?));
         let response = Box::pin(call_within_budgets(route, request, connection, credential));

@@ -377,6 +377,7 @@ mod tests {
     use prost::Message as _;
 
     use super::*;
+    use crate::admission::Account;
     use crate::service::reply_body::take_body;
     use crate::service::reply_budget::{ConnectionReplyBudget, ReplyBudget};
 
@@ -486,7 +487,7 @@ mod tests {
                 reply.shrink_to(60);
                 reply.send(v1::StreamForcesResponse { receiver_error: "x".repeat(50), ..Default::default() }).await
             };
-            respond(connection.new_call(), work)
+            respond(connection.new_call(&Account::server()), work)
         };
         let unread = start_call().await;
         run_other_tasks().await;
@@ -502,14 +503,14 @@ mod tests {
     #[tokio::test]
     async fn unary_reply_is_built_after_it_has_budget() {
         let connection = small_connection();
-        let unread = connection.new_call().acquire(50).await.expect("expected capacity");
+        let unread = connection.new_call(&Account::server()).acquire(50).await.expect("expected capacity");
         let is_built = Arc::new(AtomicBool::new(false));
         let mark_built = Arc::clone(&is_built);
         let build = async move {
             mark_built.store(true, Ordering::Relaxed);
             Ok(v1::DeleteSceneResponse {})
         };
-        let mut call = Box::pin(respond_once(connection.new_call(), 60, build));
+        let mut call = Box::pin(respond_once(connection.new_call(&Account::server()), 60, build));
         let pending = tokio::time::timeout(Duration::from_millis(50), call.as_mut()).await;
         assert!(pending.is_err() && !is_built.load(Ordering::Relaxed), "expected no reply without budget");
         drop(unread);

@@ -41,7 +41,7 @@ ITEMS = {
 # For items with checks, the part of the subject that is not claimed.
 NOT_CLAIMED = {
     4: "frames count against the budget of replies while they wait for their first byte to be sent",
-    6: "loads have a deadline and equal shares",
+    6: "loads have a deadline",
     9: "while no other frame is drawn, Mesa keeps the memory of the last one",
     12: "names in the errors of all loaders",
     13: "faults of CUDA here, without a GPU; tests/gpu/faults.rs plans them on one",
