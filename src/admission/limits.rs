@@ -121,6 +121,16 @@ impl Limit {
         when_full: WhenFull::Wait,
     };
 
+    /// Each has 8 MiB in each direction.
+    pub const SHARED_MEMORY: &'static Self = &Self {
+        resource: "shared_memory",
+        objects: "connections for shared memory",
+        option: None,
+        total: |_| 64,
+        reserve_divisor: 8,
+        when_full: WhenFull::Refuse { minimum: 1 },
+    };
+
     /// They count to the principal, whichever client it uploads with.
     pub const STORED_BYTES: &'static Self = &Self {
         resource: "stored_bytes",
@@ -133,7 +143,7 @@ impl Limit {
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 10] = [
+pub const LIMITS: [&Limit; 11] = [
     Limit::CONNECTIONS,
     Limit::SUBSCRIPTIONS,
     Limit::WAITING_REQUESTS,
@@ -143,6 +153,7 @@ pub const LIMITS: [&Limit; 10] = [
     Limit::REPLY_BYTES,
     Limit::LOADS,
     Limit::BUILT_IN_LOADS,
+    Limit::SHARED_MEMORY,
     Limit::STORED_BYTES,
 ];
 

@@ -61,6 +61,7 @@ use self::routes::Routes;
 use self::shared_memory::SharedMemory;
 use self::tls::TlsServer;
 use self::web::{Access, WebServer};
+use crate::admission::Limit;
 use crate::config::Config;
 use crate::engine::Engine;
 use modalcast_model::error::{Error, Result, fault_in};
@@ -116,7 +117,10 @@ pub async fn serve(
     let metrics = engine.admission_metrics();
     let connection_server =
         ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config, metrics);
-    let _shared_memory_server = shared_memory_socket.map(|socket| shared_memory.serve(socket));
+    let _shared_memory_server = shared_memory_socket.map(|socket| {
+        let limit = Limit::SHARED_MEMORY;
+        shared_memory.serve(socket, metrics.pool(limit, (limit.total)(&config)))
+    });
     let table = ConnectionTable::new(config.connections, metrics);
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());

@@ -2,7 +2,7 @@
 //! protocol. Shared memory is off unless the configuration names a Unix socket.
 //!
 //! A connection to that socket owns slots for replies and slots for steps, whose memory is bounded: at most
-//! [`MAX_CONNECTIONS`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies.
+//! [`crate::admission::Limit::SHARED_MEMORY`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies.
 //! The copied values of a step count as those of a step in several messages. A call without a free slot for a reply
 //! waits until its client returns one or the connection ends. The first call that uses a connection binds it to the
 //! principal of the call.
@@ -23,18 +23,16 @@ use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, Shutdown
 use tokio::io::{AsyncReadExt as _, Interest};
 use tokio::net::unix::OwnedWriteHalf;
 use tokio::net::{UnixListener, UnixStream};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::{JoinHandle, JoinSet};
 use tonic::metadata::MetadataMap;
 
 use self::reply_memory::{ReplyMemory, SLOT_BYTES, SLOT_COUNT};
 use self::request_memory::RequestMemory;
+use super::peer::Peer;
+use crate::admission::{Account, Permit, PermitPool};
 use crate::engine::lock;
 use crate::identity::Principal;
 use modalcast_model::error::{Result, invalid};
-
-/// Limit on the connections. A further one is closed.
-const MAX_CONNECTIONS: usize = 64;
 
 /// Version of the handshake.
 const HANDSHAKE_VERSION: u32 = 1;
@@ -74,8 +72,8 @@ pub(super) struct CallMemory(Option<Arc<ConnectionMemory>>);
 
 impl SharedMemory {
     /// Creates memory for the clients of a socket.
-    pub(super) fn serve(&self, listener: UnixListener) -> SharedMemoryServer {
-        SharedMemoryServer(tokio::spawn(accept_connections(listener, self.clone())))
+    pub(super) fn serve(&self, listener: UnixListener, permits: PermitPool) -> SharedMemoryServer {
+        SharedMemoryServer(tokio::spawn(accept_connections(listener, self.clone(), permits)))
     }
 
     /// The memory that a call of a principal asks for.
@@ -144,18 +142,17 @@ impl Drop for SharedMemoryServer {
     }
 }
 
-async fn accept_connections(listener: UnixListener, memory: SharedMemory) {
-    let permits = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+async fn accept_connections(listener: UnixListener, memory: SharedMemory, permits: PermitPool) {
     // Ends all connections when this task is aborted.
     let mut connections = JoinSet::new();
     loop {
         while connections.try_join_next().is_some() {}
         match listener.accept().await {
-            Ok((socket, _)) => match Arc::clone(&permits).try_acquire_owned() {
+            Ok((socket, _)) => match permits.acquire(&account_of(&socket)) {
                 Ok(permit) => {
                     connections.spawn(run_connection(socket, memory.clone(), permit));
                 }
-                Err(_) => tracing::warn!("a connection for shared memory was closed: {MAX_CONNECTIONS} exist"),
+                Err(error) => tracing::warn!(%error, "a connection for shared memory was closed"),
             },
             Err(error) => {
                 tracing::warn!(%error, "a connection for shared memory could not be accepted");
@@ -165,7 +162,13 @@ async fn accept_connections(listener: UnixListener, memory: SharedMemory) {
     }
 }
 
-async fn run_connection(socket: UnixStream, memory: SharedMemory, permit: OwnedSemaphorePermit) {
+/// The account of a connection: all clients are of the user of the server.
+fn account_of(socket: &UnixStream) -> Account {
+    let pid = socket.peer_cred().ok().and_then(|credentials| credentials.pid());
+    Account::new(&Principal::owner(), Peer::new(String::new(), None, pid).client())
+}
+
+async fn run_connection(socket: UnixStream, memory: SharedMemory, permit: Permit) {
     if let Err(error) = serve_memory(socket, &memory, permit).await {
         tracing::warn!(%error, "a connection for shared memory was closed");
     }
@@ -176,7 +179,7 @@ async fn run_connection(socket: UnixStream, memory: SharedMemory, permit: OwnedS
 /// # Errors
 /// `PermissionDenied` for a client of another user; `InvalidData` if the client returns a slot that it does not have;
 /// errors of the system.
-async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: OwnedSemaphorePermit) -> io::Result<()> {
+async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: Permit) -> io::Result<()> {
     check_user(socket.peer_cred()?.uid())?;
     let (replies, reply_file) = ReplyMemory::new(permit)?;
     let (requests, request_file) = RequestMemory::new()?;
@@ -259,6 +262,7 @@ mod tests {
     use tonic::metadata::MetadataValue;
 
     use super::*;
+    use crate::admission::Limit;
     use crate::identity::Role;
     use crate::service::status::to_status;
 
@@ -271,8 +275,7 @@ mod tests {
 
     /// The memory of a connection, and the socket of its client.
     fn new_connection() -> (ConnectionMemory, UnixStream) {
-        let permit = Arc::new(Semaphore::new(1)).try_acquire_owned().expect("expected a permit");
-        let (replies, _) = ReplyMemory::new(permit).expect("expected memory");
+        let (replies, _) = ReplyMemory::new(Permit::for_test(Limit::SHARED_MEMORY)).expect("expected memory");
         let (requests, _) = RequestMemory::new().expect("expected memory");
         let (socket, client) = UnixStream::pair().expect("expected sockets");
         (ConnectionMemory { replies, requests, returns: socket.into_split().1, principal: OnceLock::new() }, client)

@@ -8,8 +8,9 @@ use bytes::Bytes;
 use memmap2::{MmapOptions, MmapRaw};
 use modalcast_proto::v1;
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create};
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::Semaphore;
 
+use crate::admission::Permit;
 use crate::engine::lock;
 
 /// Size of a slot in bytes: the largest chunk of a reply.
@@ -31,7 +32,7 @@ pub(in crate::service) struct ReplyMemory {
     /// One permit for each free slot. Closed when the connection has ended.
     free_slots: Semaphore,
     /// Counts the connection against the limit on connections.
-    _permit: OwnedSemaphorePermit,
+    _permit: Permit,
 }
 
 #[derive(Debug)]
@@ -45,7 +46,7 @@ struct Slots {
 impl ReplyMemory {
     /// Creates the memory, and returns it with a file through which a client can read it. The size of the file cannot
     /// change, and only the mapping of this process can write to it.
-    pub(super) fn new(permit: OwnedSemaphorePermit) -> io::Result<(Self, OwnedFd)> {
+    pub(super) fn new(permit: Permit) -> io::Result<(Self, OwnedFd)> {
         let file = memfd_create("modalcast-replies", MemfdFlags::CLOEXEC | MemfdFlags::ALLOW_SEALING)?;
         ftruncate(&file, (SLOT_COUNT * SLOT_BYTES) as u64)?;
         let mapping = MmapOptions::new().len(SLOT_COUNT * SLOT_BYTES).map_raw(&file)?;
@@ -107,16 +108,15 @@ impl ReplyMemory {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Arc;
     use std::time::Duration;
 
     use rustix::fs::{fcntl_get_seals, fstat};
 
     use super::*;
+    use crate::admission::Limit;
 
     fn new_memory() -> (ReplyMemory, OwnedFd) {
-        let permit = Arc::new(Semaphore::new(1)).try_acquire_owned().expect("expected a permit");
-        ReplyMemory::new(permit).expect("expected memory")
+        ReplyMemory::new(Permit::for_test(Limit::SHARED_MEMORY)).expect("expected memory")
     }
 
     fn data(byte: u8) -> Bytes {
