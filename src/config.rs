@@ -311,6 +311,9 @@ pub struct Config {
     /// Time within which a connection must send its first request, from the preface of HTTP/2 or the handshake of a
     /// WebSocket on.
     pub first_request_timeout: Duration,
+    /// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
+    /// delayed, so wrong ones do not lock out other clients.
+    pub wrong_token_delay: Duration,
     /// Interval of keepalive pings of HTTP/2 and WebSockets.
     pub keepalive_interval: Duration,
     /// Time within which the client must answer a keepalive ping.
@@ -372,6 +375,7 @@ impl Default for Config {
             connections: 1024,
             handshake_timeout: Duration::from_secs(5),
             first_request_timeout: Duration::from_secs(30),
+            wrong_token_delay: Duration::from_millis(500),
             keepalive_interval: Duration::from_secs(10),
             keepalive_timeout: Duration::from_secs(5),
         }
@@ -471,6 +475,7 @@ impl Config {
         check_range("drain_timeout (ms)", ms(self.drain_timeout), 1, HOUR_MS)?;
         check_range("handshake_timeout (ms)", ms(self.handshake_timeout), 1, HOUR_MS)?;
         check_range("first_request_timeout (ms)", ms(self.first_request_timeout), 1, HOUR_MS)?;
+        check_range("wrong_token_delay (ms)", ms(self.wrong_token_delay), 1, HOUR_MS)?;
         check_range("keepalive_interval (ms)", ms(self.keepalive_interval), 100, HOUR_MS)?;
         check_range("keepalive_timeout (ms)", ms(self.keepalive_timeout), 100, HOUR_MS)?;
         if self.listen.is_empty() {

@@ -15,10 +15,6 @@ use crate::engine::lock;
 use crate::identity::{CertificateName, Credential, Directory};
 use modalcast_model::error::{Error, Result};
 
-/// Time before the answer to a wrong token, which bounds how many tokens one connection can try. A right token is never
-/// delayed, so wrong ones do not lock out other clients.
-pub(super) const WRONG_TOKEN_DELAY: Duration = Duration::from_millis(500);
-
 /// Shortest time between two log records of rejected calls.
 const LOG_INTERVAL: Duration = Duration::from_secs(1);
 
@@ -27,6 +23,7 @@ const LOG_INTERVAL: Duration = Duration::from_secs(1);
 pub(super) struct Authenticator {
     directory: Arc<Directory>,
     authentication: Authentication,
+    wrong_token_delay: Duration,
     rejections: Mutex<Rejections>,
     /// All rejected calls.
     failures: Counter,
@@ -52,13 +49,23 @@ impl Authenticator {
     /// As for [`Directory::open`].
     pub(super) fn new(config: &Config) -> Result<Arc<Self>> {
         let directory = Directory::open(&config.token_file(), config.principals.as_deref())?;
-        let authentication = config.authentication;
         let (rejections, failures) = (Mutex::default(), Counter::default());
-        Ok(Arc::new(Self { directory: Arc::new(directory), authentication, rejections, failures }))
+        Ok(Arc::new(Self {
+            directory: Arc::new(directory),
+            authentication: config.authentication,
+            wrong_token_delay: config.wrong_token_delay,
+            rejections,
+            failures,
+        }))
     }
 
     pub(super) fn directory(&self) -> &Arc<Directory> {
         &self.directory
+    }
+
+    /// Waits before the answer to a wrong token.
+    pub(super) async fn delay_wrong_token(&self) {
+        tokio::time::sleep(self.wrong_token_delay).await;
     }
 
     /// The number of rejected calls.
@@ -115,7 +122,7 @@ impl Authenticator {
         let Requirement::Role(role) = requirement else { return Ok(None) };
         let of_call = self.credential_of_call(headers, connection);
         let wrong_token = |()| Denial {
-            delay: WRONG_TOKEN_DELAY,
+            delay: self.wrong_token_delay,
             ..self.deny(unauthenticated("a token that this server knows", "another token"), peer)
         };
         let Some(credential) = of_call.map_err(wrong_token)?.filter(|credential| !credential.is_revoked()) else {

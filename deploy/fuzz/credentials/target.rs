@@ -105,6 +105,8 @@ impl WebSocketTarget {
             state: folder.path().to_owned(),
             backend: BackendChoice::Cpu,
             renderer: RendererChoice::Off,
+            // Many inputs have a wrong token.
+            wrong_token_delay: Duration::from_millis(1),
             ..Config::default()
         };
         let address = runtime.block_on(async {

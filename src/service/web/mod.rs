@@ -32,7 +32,7 @@ pub(super) use self::access::Access;
 use self::access::{Arrival, Denied};
 use self::page::Page;
 use self::websocket::{WebSocketLimits, serve_websocket};
-use super::authentication::{Authenticator, WRONG_TOKEN_DELAY, bearer_token};
+use super::authentication::{Authenticator, bearer_token};
 use super::connection::ConnectionInfo;
 use super::connection_table::ConnectionSlot;
 use super::listen::Socket;
@@ -107,8 +107,8 @@ impl WebServer {
         let Ok(upgraded) = on_upgrade.await else { return };
         let Ok(parts) = upgraded.downcast::<TokioIo<MeteredSocket<Socket, ()>>>() else { return };
         let socket = parts.io.into_inner().socket;
-        let (routes, sessions) = (self.routes.clone(), Arc::clone(self.authenticator.directory()));
-        serve_websocket(socket, parts.read_buf, routes, sessions, info, slot, self.websocket_limits).await;
+        let (routes, authenticator) = (self.routes.clone(), Arc::clone(&self.authenticator));
+        serve_websocket(socket, parts.read_buf, routes, authenticator, info, slot, self.websocket_limits).await;
     }
 
     /// Answers one request. Returns the upgrade if it was the handshake of a WebSocket.
@@ -183,7 +183,7 @@ impl WebServer {
         match sessions.redeem(&String::from_utf8_lossy(&code)) {
             Ok(Some(session)) => text_answer(StatusCode::OK, session),
             Ok(None) => {
-                tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+                self.authenticator.delay_wrong_token().await;
                 text_answer(StatusCode::FORBIDDEN, "expected the code of a link that is not used yet\n")
             }
             Err(error) => text_answer(StatusCode::INTERNAL_SERVER_ERROR, error.to_string()),
@@ -198,7 +198,7 @@ impl WebServer {
         let session = bearer_token(headers);
         let is_known = |session| self.authenticator.directory().viewer_sessions().find(session).is_some();
         if info.credential.is_none() && !session.is_some_and(is_known) {
-            tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+            self.authenticator.delay_wrong_token().await;
             return text_answer(StatusCode::FORBIDDEN, "expected the token of a session of this server\n");
         }
         answer_with(StatusCode::OK, "application/octet-stream", recording.clone())

@@ -14,7 +14,7 @@ use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
 
-use super::super::authentication::WRONG_TOKEN_DELAY;
+use super::super::authentication::Authenticator;
 use super::super::connection::ConnectionInfo;
 use super::super::connection_table::{ConnectionSlot, GOAWAY_TIMEOUT};
 use super::super::listen::Socket;
@@ -28,7 +28,6 @@ use super::envelope::{CallHead, ClientContent, ClientMessage, ENVELOPE_BYTES};
 use super::frame_meter::{FrameMeter, Traffic};
 use super::outgoing::{Outgoing, write_messages};
 use crate::config::Config;
-use crate::identity::Directory;
 use modalcast_model::error::Error;
 
 /// Limit on the open calls of one connection.
@@ -121,7 +120,7 @@ pub(super) async fn serve_websocket(
     socket: Socket,
     first_bytes: Bytes,
     routes: Routes,
-    sessions: Arc<Directory>,
+    authenticator: Arc<Authenticator>,
     info: ConnectionInfo,
     slot: &ConnectionSlot,
     limits: WebSocketLimits,
@@ -140,7 +139,7 @@ pub(super) async fn serve_websocket(
     let mut writer = new_stream(write_socket, limits.library_settings()).await;
     let (outgoing, mut queue) = mpsc::channel(OUTGOING_CAPACITY);
     let keep_alive = keep_alive(&traffic, outgoing.clone(), limits);
-    let calls = Calls::new(routes, sessions, info, outgoing);
+    let calls = Calls::new(routes, authenticator, info, outgoing);
     let reason = {
         let mut write = std::pin::pin!(write_messages(&mut writer, &mut queue, &traffic.sent));
         let reason = tokio::select! {
@@ -203,7 +202,7 @@ struct OpenCall {
 /// The calls of a connection. Dropping them cancels them.
 struct Calls {
     routes: Routes,
-    sessions: Arc<Directory>,
+    authenticator: Arc<Authenticator>,
     info: ConnectionInfo,
     outgoing: mpsc::Sender<Outgoing>,
     /// Calls whose status is not queued yet, and ended calls that are not removed yet.
@@ -217,10 +216,15 @@ struct Calls {
 }
 
 impl Calls {
-    fn new(routes: Routes, sessions: Arc<Directory>, info: ConnectionInfo, outgoing: mpsc::Sender<Outgoing>) -> Self {
+    fn new(
+        routes: Routes,
+        authenticator: Arc<Authenticator>,
+        info: ConnectionInfo,
+        outgoing: mpsc::Sender<Outgoing>,
+    ) -> Self {
         Self {
             routes,
-            sessions,
+            authenticator,
             info,
             outgoing,
             open: HashMap::new(),
@@ -299,8 +303,8 @@ impl Calls {
 
     /// Gives later calls the rights of a session.
     async fn set_session(&mut self, token: &str) -> Result<(), CloseReason> {
-        let Some(credential) = self.sessions.viewer_sessions().find(token) else {
-            tokio::time::sleep(WRONG_TOKEN_DELAY).await;
+        let Some(credential) = self.authenticator.directory().viewer_sessions().find(token) else {
+            self.authenticator.delay_wrong_token().await;
             return Err(CloseReason::unknown_session());
         };
         self.info.begin_session(token, credential);
