@@ -1,4 +1,14 @@
-//! Routes calls to services by the first component of their path.
+//! Routes calls to services by the first component of their path. A call passes these layers, in this order:
+//!
+//! 1. [`Authenticator::admit`] finds its credential and checks its role.
+//! 2. [`ConnectionInfo::identify`] finds the account to which it counts.
+//! 3. [`answer_in_time`] ends it at its timeout, if the service does not.
+//! 4. [`interruption_of`] ends it when its credential is revoked or its connection is preempted.
+//! 5. [`RequestBody`] counts the bytes of its requests.
+//! 6. The service acquires permits of what it uses; see [`crate::admission`].
+//! 7. [`replace_body`] counts the bytes of its replies until they are sent.
+//! 8. [`CountedReplyBody`] records its replies as progress of the connection.
+//! 9. [`InterruptibleBody`] ends a response that has begun, for the reasons of layer 4.
 
 use std::collections::BTreeMap;
 use std::convert::Infallible;
