@@ -11,14 +11,16 @@
 mod account;
 mod grant;
 mod limits;
-mod metrics;
+
 mod permit;
+mod pools;
 mod progress;
 mod queue;
 mod sharing;
 
 pub use account::{Account, Client};
 pub use limits::{LIMITS, Limit, WhenFull};
-pub use metrics::AdmissionMetrics;
+
 pub use permit::{Permit, PermitHandle, PermitPool};
+pub use pools::Admission;
 pub use queue::{Queue, QueueMember, Units};

@@ -9,7 +9,7 @@ use tokio::sync::Notify;
 use super::account::Account;
 use super::grant::{Grant, lock};
 use super::limits::Limit;
-use super::metrics::{AdmissionMetrics, ResourceMetrics};
+use super::pools::{Admission, ResourceMetrics};
 use super::sharing::{Decision, Holders, Share};
 use modalcast_model::error::{Error, Result};
 
@@ -56,7 +56,7 @@ pub struct PermitHandle {
     grant: Arc<Grant>,
 }
 
-impl AdmissionMetrics {
+impl Admission {
     /// A pool of `total` permits that is counted here.
     pub fn pool(&self, limit: &'static Limit, total: usize) -> PermitPool {
         let share = Share { total, reserve: total / limit.reserve_divisor, when_full: limit.when_full };
@@ -192,7 +192,7 @@ impl Permit {
     /// A permit of a pool of its own.
     #[cfg(test)]
     pub(crate) fn for_test(limit: &'static Limit) -> Self {
-        let pool = super::AdmissionMetrics::default().pool(limit, 1);
+        let pool = super::Admission::default().pool(limit, 1);
         pool.acquire(&Account::server()).expect("expected a free permit")
     }
 

@@ -1,15 +1,15 @@
 //! Properties of the sharing rule, in random sequences of clients that come, work and go.
 
 use super::super::limits::Limit;
-use super::super::metrics::AdmissionMetrics;
 use super::super::permit::{Permit, PermitPool};
+use super::super::pools::Admission;
 use super::*;
 use modalcast_model::error::Error;
 
 const TOTAL: usize = 32;
 
 fn pool(total: usize) -> PermitPool {
-    AdmissionMetrics::default().pool(Limit::CONNECTIONS, total)
+    Admission::default().pool(Limit::CONNECTIONS, total)
 }
 
 fn account(principal: &str, client: u64) -> Account {
@@ -214,7 +214,7 @@ async fn preempted_holder_learns_what_it_held() {
 
 #[test]
 fn scenes_are_left_for_new_clients_and_other_principals() {
-    let pool = AdmissionMetrics::default().pool(Limit::OPEN_SCENES, 16);
+    let pool = Admission::default().pool(Limit::OPEN_SCENES, 16);
     let is_granted = |permits: &mut Vec<Permit>, account: Account| match pool.acquire(&account) {
         Ok(permit) => {
             assert!(pool.held() <= 16);

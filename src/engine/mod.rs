@@ -103,7 +103,7 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_permits::{UploadPermit, UploadPermits};
-use crate::admission::{Account, AdmissionMetrics, Client, Limit, Queue};
+use crate::admission::{Account, Admission, Client, Limit, Queue};
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
@@ -188,8 +188,8 @@ impl Engine {
         let owners = WorkOwners::new(Some(Arc::clone(&crash_log)));
         let DeviceThread { handle, info, thread: device_thread } =
             DeviceThread::start(open_device, config.device_work_limit, owners).await?;
-        let admission_metrics = AdmissionMetrics::default();
-        let upload_permits = UploadPermits::new(&config, &admission_metrics);
+        let admission = Admission::default();
+        let upload_permits = UploadPermits::new(&config, &admission);
         for upload in stored_uploads {
             upload_permits.store(&upload.scene, Some(upload.owner.into()), upload.bytes);
         }
@@ -200,10 +200,10 @@ impl Engine {
                 checkpoints,
                 run_counter,
                 config: Arc::clone(&config),
-                admission_metrics: admission_metrics.clone(),
+                admission: admission.clone(),
             },
             memory: MemoryBudgets::new(info.memory, info.renderer.is_ok()),
-            registry: Registry::new(admission_metrics.pool(Limit::OPEN_SCENES, config.open_scenes)),
+            registry: Registry::new(admission.pool(Limit::OPEN_SCENES, config.open_scenes)),
             frame_streams: Arc::default(),
             config,
             source,
@@ -231,8 +231,8 @@ impl Engine {
     }
 
     /// The counters of refused and preempted permits.
-    pub fn admission_metrics(&self) -> &AdmissionMetrics {
-        &self.shared.services.admission_metrics
+    pub fn admission(&self) -> &Admission {
+        &self.shared.services.admission
     }
 
     /// The server's configuration.

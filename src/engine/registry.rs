@@ -294,7 +294,7 @@ pub(super) fn hidden_name_error(name: &str) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::admission::{AdmissionMetrics, Client, Limit};
+    use crate::admission::{Admission, Client, Limit};
     use crate::identity::Role;
 
     fn account(client: u64) -> Account {
@@ -310,7 +310,7 @@ mod tests {
     }
 
     fn registry(max_scenes: usize) -> Registry {
-        Registry::new(AdmissionMetrics::default().pool(Limit::OPEN_SCENES, max_scenes))
+        Registry::new(Admission::default().pool(Limit::OPEN_SCENES, max_scenes))
     }
 
     #[test]

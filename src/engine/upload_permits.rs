@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
 use super::lock::lock;
-use crate::admission::{Account, AdmissionMetrics, Client, Limit, Permit, PermitPool};
+use crate::admission::{Account, Admission, Client, Limit, Permit, PermitPool};
 use crate::config::Config;
 use modalcast_model::error::Result;
 
@@ -32,7 +32,7 @@ fn account_of_principal(principal: Option<Arc<str>>) -> Account {
 }
 
 impl UploadPermits {
-    pub(super) fn new(config: &Config, metrics: &AdmissionMetrics) -> Arc<Self> {
+    pub(super) fn new(config: &Config, metrics: &Admission) -> Arc<Self> {
         let pool = |limit: &'static Limit| metrics.pool(limit, (limit.total)(config));
         Arc::new(Self { uploads: pool(Limit::UPLOADS), bytes: pool(Limit::STORED_BYTES), stored: Mutex::default() })
     }
@@ -77,7 +77,7 @@ mod tests {
     }
 
     fn permits(stored_bytes: u64) -> Arc<UploadPermits> {
-        UploadPermits::new(&Config { stored_bytes, ..Config::default() }, &AdmissionMetrics::default())
+        UploadPermits::new(&Config { stored_bytes, ..Config::default() }, &Admission::default())
     }
 
     fn limit_of(result: Result<UploadPermit>) -> &'static str {

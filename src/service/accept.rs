@@ -27,7 +27,7 @@ use super::peer::Peer;
 use super::routes::Routes;
 use super::tls::TlsServer;
 use super::web::WebServer;
-use crate::admission::{Account, AdmissionMetrics};
+use crate::admission::{Account, Admission};
 use crate::config::Config;
 
 /// Pause of the listener after a failed accept.
@@ -63,7 +63,7 @@ impl ConnectionServer {
         tls: Option<Arc<TlsServer>>,
         connections: ConnectionGauges,
         config: &Config,
-        metrics: &AdmissionMetrics,
+        metrics: &Admission,
     ) -> Arc<Self> {
         Arc::new(Self {
             routes,

@@ -9,7 +9,7 @@ use super::open_calls::OpenCalls;
 use super::peer::Peer;
 use super::receive_budget::{ConnectionReceiveBudget, ReceiveBudget};
 use super::reply_budget::{ConnectionReplyBudget, ReplyBudget};
-use crate::admission::{Account, AdmissionMetrics, Client, PermitHandle};
+use crate::admission::{Account, Admission, Client, PermitHandle};
 use crate::config::Config;
 use crate::identity::{Credential, Principal, TokenHash};
 use modalcast_model::error::{Error, Result, fault, fault_in};
@@ -34,7 +34,7 @@ pub(super) struct Budgets {
 }
 
 impl Budgets {
-    pub(super) fn new(config: &Config, metrics: &AdmissionMetrics) -> Self {
+    pub(super) fn new(config: &Config, metrics: &Admission) -> Self {
         Self {
             receive: ReceiveBudget::new(config, metrics),
             reply: ReplyBudget::new(config),

@@ -6,7 +6,7 @@ use std::time::Duration;
 use tokio::sync::{Notify, watch};
 
 use super::open_calls::OpenCalls;
-use crate::admission::{Account, AdmissionMetrics, Limit, Permit, PermitHandle, PermitPool};
+use crate::admission::{Account, Admission, Limit, Permit, PermitHandle, PermitPool};
 use modalcast_model::error::Result;
 
 /// Limit on the preempted connections that have not ended. New connections wait when it is reached. Above half of it,
@@ -37,8 +37,8 @@ pub(super) struct ConnectionSlot {
 }
 
 impl ConnectionTable {
-    pub(super) fn new(max_connections: usize, metrics: &AdmissionMetrics) -> Arc<Self> {
-        let permits = metrics.pool(Limit::CONNECTIONS, max_connections);
+    pub(super) fn new(max_connections: usize, admission: &Admission) -> Arc<Self> {
+        let permits = admission.pool(Limit::CONNECTIONS, max_connections);
         Arc::new(Self { permits, is_retiring: watch::Sender::new(false) })
     }
 
@@ -120,7 +120,7 @@ mod tests {
     }
 
     fn table(max_connections: usize) -> Arc<ConnectionTable> {
-        ConnectionTable::new(max_connections, &AdmissionMetrics::default())
+        ConnectionTable::new(max_connections, &Admission::default())
     }
 
     async fn insert(table: &ConnectionTable, client: u64) -> ConnectionSlot {

@@ -81,7 +81,7 @@ mod tests {
     use tonic::Code;
 
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics, Client, Limit};
+    use crate::admission::{Account, Admission, Client, Limit};
     use crate::hang_guard::HANG_GUARD;
     use crate::identity::Principal;
 
@@ -107,7 +107,7 @@ mod tests {
 
     #[tokio::test]
     async fn body_ends_when_its_credential_is_revoked_or_its_connection_preempted() {
-        let pool = AdmissionMetrics::default().pool(Limit::CONNECTIONS, 1);
+        let pool = Admission::default().pool(Limit::CONNECTIONS, 1);
         let permit = pool.acquire(&account(1)).expect("expected a permit");
         let credential = Credential::new(Arc::new(Principal::owner()), None);
         let interruption = interruption_of(Some(Arc::clone(&credential)), permit.handle());

@@ -114,7 +114,7 @@ pub async fn serve(
         let admin_server = AdminServer::new(engine.clone(), is_serving, &connections, failures);
         admin_tasks.spawn(admin_server.accept_connections(sockets));
     }
-    let metrics = engine.admission_metrics();
+    let metrics = engine.admission();
     let connection_server =
         ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config, metrics);
     let _shared_memory_server = shared_memory_socket.map(|socket| {

@@ -9,7 +9,7 @@ use std::pin::Pin;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use crate::admission::{Account, AdmissionMetrics, Limit, Permit, PermitHandle, PermitPool};
+use crate::admission::{Account, Admission, Limit, Permit, PermitHandle, PermitPool};
 use crate::config::Config;
 use crate::engine::lock;
 use modalcast_model::error::{Error, Result};
@@ -42,7 +42,7 @@ pub(super) struct ConnectionReceiveBudget {
 }
 
 impl ReceiveBudget {
-    pub(super) fn new(config: &Config, metrics: &AdmissionMetrics) -> Arc<Self> {
+    pub(super) fn new(config: &Config, metrics: &Admission) -> Arc<Self> {
         let bytes = metrics.pool(Limit::RECEIVED_BYTES, (Limit::RECEIVED_BYTES.total)(config));
         let message_limits = MessageLimits { max_bytes: config.message_bytes, timeout: config.message_timeout };
         Arc::new(Self { bytes, message_limits })
@@ -142,7 +142,7 @@ mod tests {
 
     /// A budget of 100 bytes, of which one client may hold 75.
     fn small_budget() -> Arc<ReceiveBudget> {
-        ReceiveBudget::new(&Config { receive_bytes: 100, ..Config::default() }, &AdmissionMetrics::default())
+        ReceiveBudget::new(&Config { receive_bytes: 100, ..Config::default() }, &Admission::default())
     }
 
     fn connection(budget: &Arc<ReceiveBudget>, client: u64) -> Arc<ConnectionReceiveBudget> {

@@ -228,7 +228,7 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics, Client, Limit, Permit};
+    use crate::admission::{Account, Admission, Client, Limit, Permit};
     use crate::config::Config;
     use crate::service::receive_budget::ReceiveBudget;
 
@@ -286,7 +286,7 @@ mod tests {
 
     /// A budget of which one client may hold 600 bytes.
     fn budget() -> Arc<ReceiveBudget> {
-        ReceiveBudget::new(&Config { receive_bytes: 800, ..Config::default() }, &AdmissionMetrics::default())
+        ReceiveBudget::new(&Config { receive_bytes: 800, ..Config::default() }, &Admission::default())
     }
 
     fn account(client: u64) -> Account {

@@ -144,12 +144,12 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics};
+    use crate::admission::{Account, Admission};
     use crate::config::Config;
     use crate::service::receive_budget::ReceiveBudget;
 
     fn assembler(config: &Config) -> StepAssembler {
-        let budget = ReceiveBudget::new(config, &AdmissionMetrics::default());
+        let budget = ReceiveBudget::new(config, &Admission::default());
         let connection = budget.new_connection(&Account::server());
         StepAssembler::new(connection.new_memory(), connection.limits(), CallMemory::default())
     }

@@ -322,7 +322,7 @@ impl Server {
 
     /// Number of permits of a resource that were preempted.
     pub(crate) fn preempted(&self, resource: &'static str) -> u64 {
-        self.engine.admission_metrics().preempted.get_or_create(&[("resource", resource)]).get()
+        self.engine.admission().preempted.get_or_create(&[("resource", resource)]).get()
     }
 
     /// Stops the server and waits for its end.

@@ -41,7 +41,7 @@ use super::message::Message;
 use super::output_delivery::OutputDelivery;
 use super::output_producer::{DeliveryMode, SceneOnDevice};
 use super::step_queue::{CompletedStep, QueuedStep, StepQueue};
-use crate::admission::AdmissionMetrics;
+use crate::admission::Admission;
 use crate::config::ValidatedConfig;
 use crate::engine::blocking::run_blocking;
 use crate::engine::catch_unwind::catch_unwind_async;
@@ -62,7 +62,7 @@ pub(in crate::engine) struct SceneServices {
     pub checkpoints: Arc<CheckpointStore>,
     pub run_counter: Arc<RunCounter>,
     pub config: Arc<ValidatedConfig>,
-    pub admission_metrics: AdmissionMetrics,
+    pub admission: Admission,
 }
 
 /// Arguments of [`SceneActor::new`]: a scene that is loaded on the device and deformed to `state`.

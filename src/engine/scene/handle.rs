@@ -105,9 +105,9 @@ impl SceneHandle {
         };
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
-        let (admission_metrics, config) = (&services.admission_metrics, &services.config);
-        let subscriptions = admission_metrics.pool(Limit::SUBSCRIPTIONS, config.max_subscribers);
-        let waiting_requests = admission_metrics.pool(Limit::WAITING_REQUESTS, config.max_pending_requests);
+        let (admission, config) = (&services.admission, &services.config);
+        let subscriptions = admission.pool(Limit::SUBSCRIPTIONS, config.max_subscribers);
+        let waiting_requests = admission.pool(Limit::WAITING_REQUESTS, config.max_pending_requests);
         let failure = Arc::new(OnceLock::new());
         let checkpoints = SceneCheckpoints::new(Arc::clone(&services.checkpoints), name.clone());
         let (state_sender, current_state) = watch::channel(Arc::clone(&state));

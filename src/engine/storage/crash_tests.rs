@@ -18,7 +18,7 @@ use super::run_counter::RunCounter;
 use super::scene_catalog::SceneCatalog;
 use super::scene_record::{SceneAccess, SceneRecord};
 use super::upload::{CompleteUpload, Upload, UploadHeader};
-use crate::admission::{Account, AdmissionMetrics};
+use crate::admission::{Account, Admission};
 use crate::config::Config;
 use crate::engine::lock::lock;
 use crate::engine::testing;
@@ -322,7 +322,7 @@ impl Recorder {
     }
 
     fn permit() -> UploadPermit {
-        let permits = UploadPermits::new(&Config::default(), &AdmissionMetrics::default());
+        let permits = UploadPermits::new(&Config::default(), &Admission::default());
         permits.admit(Account::server(), 1).expect("expected a free place")
     }
 

@@ -326,13 +326,13 @@ mod tests {
 
     use super::super::file_system::DiskFileSystem;
     use super::*;
-    use crate::admission::AdmissionMetrics;
+    use crate::admission::Admission;
     use crate::config::Config;
     use crate::engine::upload_permits::UploadPermits;
 
     fn begin_upload(folder: &Path, files: u32, total_bytes: u64) -> Upload {
         let header = UploadHeader { scene: "s".into(), entry: String::new(), files, total_bytes };
-        let permits = UploadPermits::new(&Config::default(), &AdmissionMetrics::default());
+        let permits = UploadPermits::new(&Config::default(), &Admission::default());
         let permit = permits.admit(Account::server(), total_bytes).expect("expected a free permit");
         let disk: Arc<dyn FileSystem> = Arc::new(DiskFileSystem);
         Upload::begin(folder, &disk, header, permit, vec![folder.join("known")]).expect("expected a temporary folder")

@@ -10,7 +10,7 @@ use prometheus_client::registry::Registry;
 
 use super::super::connection_gauges::ConnectionGauges;
 use crate::BUILD;
-use crate::admission::AdmissionMetrics;
+use crate::admission::Admission;
 use crate::engine::Engine;
 use crate::identity::Principal;
 use modalcast_model::error::{Result, fault_in};
@@ -35,7 +35,7 @@ impl Metrics {
         registry.register("connections", "Open connections after their first bytes", connections.family());
         let help = "Calls without a known credential, and calls that the role does not permit";
         registry.register("auth_failures", help, auth_failures);
-        let AdmissionMetrics { refused, preempted } = engine.admission_metrics().clone();
+        let Admission { refused, preempted } = engine.admission().clone();
         registry.register("refused", "Clients that were refused, because they hold their share", refused);
         registry.register("preempted", "What was ended to make room for other clients", preempted);
         let memory = Family::<[(&'static str, &'static str); 2], Gauge>::default();

@@ -224,12 +224,12 @@ mod tests {
 
     use super::super::super::receive_budget::ReceiveBudget;
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics};
+    use crate::admission::{Account, Admission};
     use crate::config::Config;
 
     fn messages() -> Arc<ClientMessages> {
         let config = Config { receive_bytes: 4 << 20, ..Config::default() };
-        let budget = ReceiveBudget::new(&config, &AdmissionMetrics::default());
+        let budget = ReceiveBudget::new(&config, &Admission::default());
         ClientMessages::new(&budget.new_connection(&Account::server()))
     }
 

@@ -202,7 +202,7 @@ mod tests {
 
     use super::super::super::receive_budget::ReceiveBudget;
     use super::*;
-    use crate::admission::{Account, AdmissionMetrics};
+    use crate::admission::{Account, Admission};
     use crate::config::Config;
 
     const BINARY: u8 = 2;
@@ -223,7 +223,7 @@ mod tests {
     }
 
     fn connection_of(config: &Config) -> Arc<ConnectionReceiveBudget> {
-        ReceiveBudget::new(config, &AdmissionMetrics::default()).new_connection(&Account::server())
+        ReceiveBudget::new(config, &Admission::default()).new_connection(&Account::server())
     }
 
     fn budget() -> Arc<ConnectionReceiveBudget> {

@@ -46,7 +46,7 @@ impl TestScene {
             checkpoints: Arc::new(CheckpointStore::without_thread(folder.path().into(), &disk)),
             run_counter: Arc::new(RunCounter::open(folder.path(), &disk).expect("expected a new counter")),
             config: Arc::new(config.validated().expect("expected valid defaults")),
-            admission_metrics: AdmissionMetrics::default(),
+            admission: Admission::default(),
         };
         let params = OpenParams {
             name: "strips".into(),

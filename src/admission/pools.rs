@@ -1,4 +1,4 @@
-//! Counts refused and preempted permits by resource.
+//! All pools of a server, and the counters of refused and preempted permits by resource.
 
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
@@ -6,9 +6,9 @@ use prometheus_client::metrics::family::Family;
 /// A counter for each resource.
 type ResourceCounters = Family<[(&'static str, &'static str); 1], Counter>;
 
-/// The counters of all pools of a server. A clone shares them.
+/// The pools of a server with their counters. A clone is shallow.
 #[derive(Debug, Clone, Default)]
-pub struct AdmissionMetrics {
+pub struct Admission {
     pub refused: ResourceCounters,
     pub preempted: ResourceCounters,
 }
@@ -20,7 +20,7 @@ pub(super) struct ResourceMetrics {
     pub(super) preempted: Counter,
 }
 
-impl AdmissionMetrics {
+impl Admission {
     /// The counters of a resource, by its name in metrics.
     pub(super) fn of_resource(&self, resource: &'static str) -> ResourceMetrics {
         let counter = |counters: &ResourceCounters| counters.get_or_create_owned(&[("resource", resource)]);
