@@ -1,10 +1,12 @@
 //! The holders of permits.
 
+use std::fmt;
 use std::sync::Arc;
 
-use crate::identity::{Principal, TokenHash};
+use crate::identity::{ANONYMOUS, Principal, TokenHash};
 
-/// A holder of permits: a client of a principal.
+/// A holder of permits: a client of a principal. Its text is an id for people: `anna/process-4711`,
+/// `owner/session-ba7816bf` or `anonymous/connection-12`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Account {
     /// The name of the principal. `None` while the client is anonymous: none of its calls was admitted with a credential.
@@ -39,5 +41,23 @@ impl Account {
 
     pub const fn anonymous(client: Client) -> Self {
         Self { principal: None, client }
+    }
+
+    /// The name of the principal, or [`ANONYMOUS`].
+    pub fn principal_name(&self) -> &str {
+        self.principal.as_deref().unwrap_or(ANONYMOUS)
+    }
+}
+
+impl fmt::Display for Account {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(out, "{}/", self.principal_name())?;
+        match self.client {
+            Client::Server => out.write_str("server"),
+            Client::Any => out.write_str("any"),
+            Client::Session(token) => write!(out, "session-{}", token.short_name()),
+            Client::Process(id) => write!(out, "process-{id}"),
+            Client::Connection(number) => write!(out, "connection-{number}"),
+        }
     }
 }

@@ -16,7 +16,7 @@ mod viewer_sessions;
 pub use certificate_name::CertificateName;
 pub use directory::Directory;
 pub use file_version::{FileVersion, REFRESH_INTERVAL};
-pub use principal::{Credential, OWNER, Principal};
+pub use principal::{ANONYMOUS, Credential, OWNER, Principal};
 pub use principals_file::check_principal_name;
 pub use role::Role;
 pub use token::{TokenHash, new_token};

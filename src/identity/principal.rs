@@ -10,6 +10,9 @@ use super::role::Role;
 /// The name of the principal that has started the server.
 pub const OWNER: &str = "owner";
 
+/// Stands for the name of a principal in lists of clients none of whose calls was admitted with a credential.
+pub const ANONYMOUS: &str = "anonymous";
+
 /// Somebody who may use the server: a person, a program or a service.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Principal {

@@ -26,7 +26,7 @@ use std::time::SystemTime;
 use serde::Deserialize;
 
 use super::certificate_name::CertificateName;
-use super::principal::{Credential, OWNER, Principal};
+use super::principal::{ANONYMOUS, Credential, OWNER, Principal};
 use super::role::Role;
 use super::token::TokenHash;
 use modalcast_model::error::{Error, Result, invalid};
@@ -213,7 +213,7 @@ fn take_over_equal<K: Ord>(credentials: &mut BTreeMap<K, Arc<Credential>>, forme
 ///
 /// # Errors
 /// `Invalid` for a name with other characters than letters, digits, '-', '_', '.' and '@', of more than 64 characters, and
-/// for the name of the owner.
+/// for the names of the owner and of clients without a principal.
 pub fn check_principal_name(name: &str) -> Result<()> {
     let is_allowed = |letter: char| letter.is_ascii_alphanumeric() || "-_.@".contains(letter);
     if name.is_empty() || name.len() > MAX_NAME_CHARS || !name.chars().all(is_allowed) {
@@ -222,6 +222,9 @@ pub fn check_principal_name(name: &str) -> Result<()> {
     }
     if name == OWNER {
         return Err(invalid("name", "another name, because the user of the server is the owner", "'owner'"));
+    }
+    if name == ANONYMOUS {
+        return Err(invalid("name", "another name, because it stands for clients without a principal", "'anonymous'"));
     }
     Ok(())
 }
@@ -267,6 +270,7 @@ mod tests {
             ("[[principal]]\nname = 'anna'\nrole = 'view'\npassword = 'x'".into(), "line 4"),
             ("[[principal]]\nname = 'a\\b'\nrole = 'view'".into(), "principal[0].name"),
             ("[[principal]]\nname = 'owner'\nrole = 'view'".into(), "principal[0].name"),
+            ("[[principal]]\nname = 'anonymous'\nrole = 'view'".into(), "principal[0].name"),
             (anna.repeat(2), "principal[1].name"),
             (format!("{anna}uids = [1000]"), "principal[0].uids[0]"),
             (format!("{anna}uids = [7, 7]"), "principal[0].uids[1]"),
