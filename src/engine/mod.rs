@@ -82,6 +82,7 @@ pub(crate) use testing::lossless_lease;
 
 pub use modalcast_render::{FrameInfo, FrameLook, RasterBackend};
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
@@ -402,6 +403,17 @@ impl Engine {
     /// The scenes that a principal may use, sorted by name.
     pub fn list(&self, principal: &Principal) -> SceneList {
         self.shared.registry.list(principal)
+    }
+
+    /// The scenes that have a writer, by the client that drives them.
+    pub fn driven_scenes(&self) -> BTreeMap<Account, Vec<String>> {
+        let mut by_client = BTreeMap::<Account, Vec<String>>::new();
+        for scene_handle in self.list(&Principal::owner()).open {
+            if let Some(account) = scene_handle.writer() {
+                by_client.entry(account).or_default().push(scene_handle.name.clone());
+            }
+        }
+        by_client
     }
 
     /// The sources that [`Self::open`] accepts.

@@ -206,7 +206,7 @@ impl SceneSource for StripsSource {
 /// A request for the lease of a lossless writer.
 pub(crate) fn lossless_lease(window: u32) -> LeaseRequest {
     LeaseRequest {
-        principal: crate::identity::OWNER.into(),
+        account: crate::admission::Account::server(),
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window,

@@ -7,13 +7,13 @@ use bytes::Bytes;
 use modalcast_proto::v1;
 
 use super::status::to_rejection;
+use crate::admission::Account;
 use crate::config::{Config, MAX_STALL_BUDGET};
 use crate::engine::{
     self, ContentHash, Delivery, Engine, FailedScene, FrameFormat, InitialState, LeaseRequest, LeaseToken, OutputSpec,
     Overflow, PictureSpec, SceneAccess, SceneHandle, SceneRight, StepId, StepSelector, StreamDelivery, UploadedShape,
     WriterSession, parse_hash,
 };
-use crate::identity::Principal;
 use crate::telemetry::StageTimes;
 use modalcast_model::domain::{CreaseAngle, Material, Transform};
 use modalcast_model::error::{Result, invalid};
@@ -180,11 +180,7 @@ pub(super) fn parse_delivery(field: &str, number: i32) -> Result<Delivery> {
 }
 
 /// Parses the request of a writer for the lease of a scene. A window of 0 means `default_window`.
-pub(super) fn parse_lease_request(
-    open: &v1::OpenDrive,
-    principal: &Principal,
-    config: &Config,
-) -> Result<LeaseRequest> {
+pub(super) fn parse_lease_request(open: &v1::OpenDrive, account: &Account, config: &Config) -> Result<LeaseRequest> {
     let overflow = match v1::Overflow::try_from(open.overflow) {
         Ok(v1::Overflow::Unspecified | v1::Overflow::Block) => Overflow::Block,
         Ok(v1::Overflow::Reject) => Overflow::Reject,
@@ -199,7 +195,7 @@ pub(super) fn parse_lease_request(
     let is_token_given = !open.lease_token.is_empty();
     let token = is_token_given.then(|| LeaseToken::parse("open.lease_token", &open.lease_token)).transpose()?;
     Ok(LeaseRequest {
-        principal: principal.name.clone(),
+        account: account.clone(),
         delivery: parse_delivery("open.delivery", open.delivery)?,
         overflow,
         window: if open.window == 0 { config.window } else { open.window },

@@ -76,7 +76,7 @@ impl v1::step_service_server::StepService for StepServiceImpl {
         let v1::ResetSceneRequest { scene, take_over } = request.into_inner();
         let reset = async {
             let scene_handle = self.engine.find_opened(&scene, &caller.principal, SceneRight::Control).await?;
-            scene_handle.reset(&caller.peer, &caller.principal.name, take_over).await
+            scene_handle.reset(&caller.peer, &caller.account, take_over).await
         };
         let step = caller.log_change("ResetScene", &scene, reset.await.map_err(to_status))?;
         Ok(Response::new(v1::ResetSceneResponse { step: Some(wire_step_id(step)) }))
@@ -173,7 +173,7 @@ impl DriveSession {
         let principal = &self.caller.principal;
         let right = if open.take_over { SceneRight::Control } else { SceneRight::Use };
         let scene_handle = self.engine.find_opened(&open.scene, principal, right).await?;
-        let request = parse_lease_request(&open, principal, self.engine.config())?;
+        let request = parse_lease_request(&open, &self.caller.account, self.engine.config())?;
         let writer = scene_handle.drive(&self.caller.peer, request.clone()).await?;
         let opened = wire_opened(&writer, &request, &scene_handle);
         self.right_ended = Box::pin(scene_handle.right_ended(principal, right));

@@ -6,12 +6,13 @@ use std::process::Command;
 use std::sync::Arc;
 use std::time::Duration;
 
+use modalcast::admission::Account;
 use modalcast::config::{BackendChoice, Config};
 use modalcast::engine::{
     Delivery, Engine, FrameOutput, LeaseRequest, OutputBody, OutputSpec, Overflow, PictureSpec, Pixels, SceneHandle,
     StepReport, StepSelector, WriterSession,
 };
-use modalcast::identity::{OWNER, Principal};
+use modalcast::identity::Principal;
 use modalcast_model::deform::VertexAttributes;
 use modalcast_model::error::Error;
 use modalcast_model::load::SceneRepository;
@@ -110,7 +111,7 @@ async fn check(expectation: &str) {
 
 async fn acquire_writer(scene: &SceneHandle) -> WriterSession {
     let request = LeaseRequest {
-        principal: OWNER.into(),
+        account: Account::server(),
         delivery: Delivery::Lossless,
         overflow: Overflow::Block,
         window: 1,

@@ -86,7 +86,7 @@ pub(super) struct ActorParams {
 /// Identifies a writer across connections.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct WriterId {
-    principal: String,
+    principal: Option<Arc<str>>,
     token: LeaseToken,
 }
 
@@ -345,9 +345,9 @@ impl SceneActor {
     /// # Errors
     /// `LeaseTaken`; `Fault` when the run or the token cannot be created. The present writer then keeps the lease.
     async fn acquire_writer(&mut self, request: LeaseRequest) -> Result<AcquiredLease> {
-        let LeaseRequest { principal, delivery, overflow, window, stall_budget, token, takes_over, initial_state } =
+        let LeaseRequest { account, delivery, overflow, window, stall_budget, token, takes_over, initial_state } =
             request;
-        let id = WriterId { principal, token: token.map_or_else(LeaseToken::random, Ok)? };
+        let id = WriterId { principal: account.principal, token: token.map_or_else(LeaseToken::random, Ok)? };
         let present_writer = self.writer.as_ref().filter(|writer| !writer.step_queue.is_closed());
         if let Some(writer) = present_writer
             && !takes_over

@@ -7,6 +7,7 @@ use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{Notify, OnceCell, mpsc, oneshot, watch};
 
 use super::actor::{ActorParams, SceneActor, SceneServices};
+use super::current_writer::{CurrentWriter, CurrentWriterEntry};
 use super::delivery::{Delivery, StreamDelivery};
 use super::forces::{ForceChannel, ForceReceipt, ForceUpdate};
 use super::lease::{AcquiredLease, InitialState, LeaseRequest, LeaseToken, WriterLease};
@@ -52,6 +53,7 @@ pub struct SceneHandle {
     current_state: watch::Receiver<Arc<SceneState>>,
     subscriptions: PermitPool,
     waiting_requests: PermitPool,
+    writer: CurrentWriter,
     /// Created when forces are applied or read for the first time.
     forces: OnceLock<Arc<ForceChannel>>,
     /// Wakes the actor when a subscription grants a credit, which permits one more result, or is dropped.
@@ -136,6 +138,7 @@ impl SceneHandle {
             current_state,
             subscriptions,
             waiting_requests,
+            writer: CurrentWriter::default(),
             forces: OnceLock::new(),
             wake,
             stop_error: OnceLock::new(),
@@ -204,22 +207,39 @@ impl SceneHandle {
     /// closed; `Busy` when the mailbox is full; `Fault` when the run cannot be written to disk.
     pub async fn drive(&self, peer: &str, request: LeaseRequest) -> Result<WriterSession> {
         let request = LeaseRequest { window: request.window.clamp(1, self.max_window), ..request };
-        let (delivery, window, principal) = (request.delivery, request.window, request.principal.clone());
+        let (delivery, window, account) = (request.delivery, request.window, request.account.clone());
         let AcquiredLease { lease, token, run, initial_state } =
             self.call(|reply| Message::AcquireWriter { request, reply }).await?;
+        let principal = account.principal_name();
         tracing::info!(scene = self.name, run, principal, peer, ?delivery, ?initial_state, "driven by a new writer");
         let (scene, checkpoints) = (Arc::clone(&self.scene), self.checkpoints.clone());
-        Ok(WriterSession { lease, scene, run, window, token, initial_state, last_number: None, checkpoints })
+        let entry = self.writer.record(run, account);
+        Ok(WriterSession {
+            lease,
+            _entry: entry,
+            scene,
+            run,
+            window,
+            token,
+            initial_state,
+            last_number: None,
+            checkpoints,
+        })
     }
 
-    /// Returns the scene to its rest state: acquires the writer lease, completes one step and releases the lease. With
-    /// `takes_over` it replaces the present writer. Returns the completed step.
+    /// The client that drives the scene.
+    pub fn writer(&self) -> Option<Account> {
+        self.writer.account()
+    }
+
+    /// Returns the scene to its rest state, for a client: acquires the writer lease, completes one step and releases the
+    /// lease. With `takes_over` it replaces the present writer. Returns the completed step.
     ///
     /// # Errors
     /// Those of [`Self::drive`] and of the step.
-    pub async fn reset(&self, peer: &str, principal: &str, takes_over: bool) -> Result<StepId> {
+    pub async fn reset(&self, peer: &str, account: &Account, takes_over: bool) -> Result<StepId> {
         let request = LeaseRequest {
-            principal: principal.to_owned(),
+            account: account.clone(),
             // Does not wait for lossless readers, so that a stalled one cannot block the call.
             delivery: Delivery::Latest,
             overflow: Overflow::Block,
@@ -381,6 +401,7 @@ impl SceneHandle {
 #[derive(Debug)]
 pub struct WriterSession {
     lease: WriterLease,
+    _entry: CurrentWriterEntry,
     scene: Arc<Scene>,
     /// The run of this writer: the number of its sequence of steps. Later writers of the server have larger runs.
     pub run: u64,

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use super::delivery::Delivery;
 use super::step_queue::{Overflow, StepQueue};
+use crate::admission::Account;
 use modalcast_model::error::{Result, fault_in, invalid};
 
 /// Identifies a writer across connections. Only the client and the server know it.
@@ -64,8 +65,8 @@ pub enum InitialState {
 /// What a writer asks for when it opens its stream.
 #[derive(Debug, Clone)]
 pub struct LeaseRequest {
-    /// Name of the principal that drives. A token identifies a writer only together with it.
-    pub principal: String,
+    /// The client that drives. A token identifies a writer only together with its principal.
+    pub account: Account,
     pub delivery: Delivery,
     pub overflow: Overflow,
     /// Number of steps that may be unacknowledged.

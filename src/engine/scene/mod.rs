@@ -3,6 +3,7 @@
 
 pub(super) mod actor;
 mod current_step;
+mod current_writer;
 pub(super) mod delivery;
 pub(super) mod encoded_subscription;
 pub(super) mod force_subscription;
