@@ -116,10 +116,22 @@ fn is_missing_source(error: &ClientError) -> bool {
 async fn has_recorded_contents(client: &Client, recording: &Recording, name: &str) -> Result<bool> {
     let mut description = client.describe_with(&DescriptionRequest::new(name).hashes()).await?;
     let recorded = recording.description();
-    // Name, source and progress of the scene do not matter.
-    let SceneInfo { scene, source, last_step, durable_step, remarks, .. } = recorded.info.clone();
-    description.info = SceneInfo { scene, source, last_step, durable_step, remarks, ..description.info };
-    Ok(description == *recorded)
+    description.info = without_usage(description.info);
+    Ok(description == SceneDescription { info: without_usage(recorded.info.clone()), ..recorded.clone() })
+}
+
+/// A scene without what says nothing about its contents: its name and source, its progress, and who uses it.
+fn without_usage(info: SceneInfo) -> SceneInfo {
+    SceneInfo {
+        scene: String::new(),
+        source: String::new(),
+        last_step: None,
+        durable_step: None,
+        remarks: Vec::new(),
+        owner: String::new(),
+        shared_with: Vec::new(),
+        ..info
+    }
 }
 
 /// The recorded meshes, modes and colors of all domains.
