@@ -200,6 +200,8 @@ pub enum Reason {
     /// RESOURCE_EXHAUSTED: the call or its connection is ended to make room for another client. Metadata "object", "held" (by
     /// this client) and "limit".
     Preempted = 24,
+    /// RESOURCE_EXHAUSTED: an administrator has ended the client of the call.
+    EndedByAdministrator = 25,
 }
 impl Reason {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -233,6 +235,7 @@ impl Reason {
             Self::Unauthenticated => "REASON_UNAUTHENTICATED",
             Self::PermissionDenied => "REASON_PERMISSION_DENIED",
             Self::Preempted => "REASON_PREEMPTED",
+            Self::EndedByAdministrator => "REASON_ENDED_BY_ADMINISTRATOR",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -263,6 +266,7 @@ impl Reason {
             "REASON_UNAUTHENTICATED" => Some(Self::Unauthenticated),
             "REASON_PERMISSION_DENIED" => Some(Self::PermissionDenied),
             "REASON_PREEMPTED" => Some(Self::Preempted),
+            "REASON_ENDED_BY_ADMINISTRATOR" => Some(Self::EndedByAdministrator),
             _ => None,
         }
     }
@@ -337,6 +341,12 @@ pub struct SceneInfo {
     /// Names of the principals with whom it is shared, or "\*" for all.
     #[prost(string, repeated, tag = "18")]
     pub shared_with: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Name of the principal that drives the scene; empty if nobody does.
+    #[prost(string, tag = "19")]
+    pub writer: ::prost::alloc::string::String,
+    /// Number of frame, vertex and state streams of the scene.
+    #[prost(uint32, tag = "20")]
+    pub streams: u32,
 }
 /// Light, sky and ground of the scene, for clients that draw the scene themselves: the table `look` of its scene.toml.
 /// Each vector has three numbers; colors are linear.
@@ -5825,6 +5835,89 @@ pub struct CreateViewerLinkResponse {
     #[prost(string, tag = "3")]
     pub public_url: ::prost::alloc::string::String,
 }
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ListClientsRequest {}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ListClientsResponse {
+    /// The clients that hold something. Those that hold the largest part of a limit come first.
+    #[prost(message, repeated, tag = "1")]
+    pub clients: ::prost::alloc::vec::Vec<ClientInfo>,
+    /// Number of further clients that are left out, because the list is too long. They hold the smallest parts.
+    #[prost(uint32, tag = "2")]
+    pub omitted: u32,
+    /// What all clients hold together, of each resource that is in use.
+    #[prost(message, repeated, tag = "3")]
+    pub resources: ::prost::alloc::vec::Vec<ResourceUse>,
+}
+/// A client and what it holds.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ClientInfo {
+    /// The name of the principal, or "anonymous", and the client, such as "anna/process-4711".
+    #[prost(string, tag = "1")]
+    pub id: ::prost::alloc::string::String,
+    /// Empty while none of the calls of the client was admitted with a credential.
+    #[prost(string, tag = "2")]
+    pub principal: ::prost::alloc::string::String,
+    #[prost(enumeration = "ClientKind", tag = "3")]
+    pub kind: i32,
+    /// The address of one of its connections; empty for a Unix socket and for a client without connections.
+    #[prost(string, tag = "4")]
+    pub address: ::prost::alloc::string::String,
+    /// The id of the process at the other end of a Unix socket; 0 if there is none.
+    #[prost(uint32, tag = "5")]
+    pub process_id: u32,
+    /// The name of this process; empty if it is not known.
+    #[prost(string, tag = "6")]
+    pub process_name: ::prost::alloc::string::String,
+    #[prost(message, repeated, tag = "7")]
+    pub held: ::prost::alloc::vec::Vec<ResourceUse>,
+    /// Time in milliseconds for which the client has held something.
+    #[prost(uint64, tag = "8")]
+    pub age_ms: u64,
+    /// Time in milliseconds since the last step, reply, frame or part of an upload of the client; unset before the first one.
+    #[prost(uint64, optional, tag = "9")]
+    pub idle_ms: ::core::option::Option<u64>,
+    /// Whether this is the client that asks.
+    #[prost(bool, tag = "10")]
+    pub is_caller: bool,
+    /// Names of the scenes that the client drives.
+    #[prost(string, repeated, tag = "11")]
+    pub driven_scenes: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// How much of a limited resource is in use.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ResourceUse {
+    /// The name in metrics, such as "connections"; deploy/README.md lists the resources.
+    #[prost(string, tag = "1")]
+    pub resource: ::prost::alloc::string::String,
+    /// What is limited, for people: "connections".
+    #[prost(string, tag = "2")]
+    pub objects: ::prost::alloc::string::String,
+    /// The scene of a resource that is limited per scene; else empty.
+    #[prost(string, tag = "3")]
+    pub scene: ::prost::alloc::string::String,
+    #[prost(uint64, tag = "4")]
+    pub held: u64,
+    /// The limit on what all clients hold together.
+    #[prost(uint64, tag = "5")]
+    pub limit: u64,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct EndClientRequest {
+    /// The id of a client in ListClientsResponse, or the name of a principal, or "anonymous", with "/\*": all of its clients
+    /// except the caller.
+    #[prost(string, tag = "1")]
+    pub id: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct EndClientResponse {
+    /// The ids of the clients.
+    #[prost(string, repeated, tag = "1")]
+    pub ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Number of their connections, streams and waiting requests that end.
+    #[prost(uint32, tag = "2")]
+    pub ended: u32,
+}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoResponse {
     /// Version of the program, for people.
@@ -5923,6 +6016,46 @@ pub struct Limits {
     #[prost(uint32, tag = "17")]
     pub stall_budget_ms: u32,
 }
+/// Who a client is, apart from its principal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum ClientKind {
+    Unspecified = 0,
+    /// The server itself: scenes of earlier runs.
+    Server = 1,
+    /// A session of the viewer.
+    Session = 2,
+    /// A process that is connected to a Unix socket.
+    Process = 3,
+    /// Any other connection. Of the calls that a proxy sends over one connection, those of each principal are a client.
+    Connection = 4,
+}
+impl ClientKind {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "CLIENT_KIND_UNSPECIFIED",
+            Self::Server => "CLIENT_KIND_SERVER",
+            Self::Session => "CLIENT_KIND_SESSION",
+            Self::Process => "CLIENT_KIND_PROCESS",
+            Self::Connection => "CLIENT_KIND_CONNECTION",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "CLIENT_KIND_UNSPECIFIED" => Some(Self::Unspecified),
+            "CLIENT_KIND_SERVER" => Some(Self::Server),
+            "CLIENT_KIND_SESSION" => Some(Self::Session),
+            "CLIENT_KIND_PROCESS" => Some(Self::Process),
+            "CLIENT_KIND_CONNECTION" => Some(Self::Connection),
+            _ => None,
+        }
+    }
+}
 /// A capability that not every server of the same protocol version has. A client tests for a feature before it depends
 /// on it, and ignores values that it does not know.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
@@ -5993,7 +6126,7 @@ pub mod server_service_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// Version, features, devices and limits of the server.
+    /// Version, features, devices and limits of the server, and its clients.
     #[derive(Debug, Clone)]
     pub struct ServerServiceClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -6126,6 +6259,57 @@ pub mod server_service_client {
                 );
             self.inner.unary(req, path, codec).await
         }
+        /// Lists the clients with what they hold of limited resources, for administrators.
+        pub async fn list_clients(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ListClientsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ListClientsResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ServerService/ListClients",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.ServerService", "ListClients"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Ends the connections, streams and waiting requests of clients with REASON_ENDED_BY_ADMINISTRATOR, and the session of a
+        /// browser. Their open scenes stay open. A client whose credential is still valid may connect again.
+        pub async fn end_client(
+            &mut self,
+            request: impl tonic::IntoRequest<super::EndClientRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::EndClientResponse>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ServerService/EndClient",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.ServerService", "EndClient"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -6157,8 +6341,25 @@ pub mod server_service_server {
             tonic::Response<super::CreateViewerLinkResponse>,
             tonic::Status,
         >;
+        /// Lists the clients with what they hold of limited resources, for administrators.
+        async fn list_clients(
+            &self,
+            request: tonic::Request<super::ListClientsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ListClientsResponse>,
+            tonic::Status,
+        >;
+        /// Ends the connections, streams and waiting requests of clients with REASON_ENDED_BY_ADMINISTRATOR, and the session of a
+        /// browser. Their open scenes stay open. A client whose credential is still valid may connect again.
+        async fn end_client(
+            &self,
+            request: tonic::Request<super::EndClientRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::EndClientResponse>,
+            tonic::Status,
+        >;
     }
-    /// Version, features, devices and limits of the server.
+    /// Version, features, devices and limits of the server, and its clients.
     #[derive(Debug)]
     pub struct ServerServiceServer<T> {
         inner: Arc<T>,
@@ -6311,6 +6512,96 @@ pub mod server_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = CreateViewerLinkSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.ServerService/ListClients" => {
+                    #[allow(non_camel_case_types)]
+                    struct ListClientsSvc<T: ServerService>(pub Arc<T>);
+                    impl<
+                        T: ServerService,
+                    > tonic::server::UnaryService<super::ListClientsRequest>
+                    for ListClientsSvc<T> {
+                        type Response = super::ListClientsResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ListClientsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ServerService>::list_clients(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ListClientsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/modalcast.v1.ServerService/EndClient" => {
+                    #[allow(non_camel_case_types)]
+                    struct EndClientSvc<T: ServerService>(pub Arc<T>);
+                    impl<
+                        T: ServerService,
+                    > tonic::server::UnaryService<super::EndClientRequest>
+                    for EndClientSvc<T> {
+                        type Response = super::EndClientResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::EndClientRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ServerService>::end_client(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = EndClientSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -7,11 +7,14 @@
 //! what it was granted for. Without a preemptible permit, or for a client that already has its share, it is refused.
 //!
 //! For resources that are returned soon, such as the bytes of replies, clients wait in a [`Queue`] instead.
+//!
+//! [`Admission`] lists the clients with what they hold, and ends them for an administrator.
 
 mod account;
 mod grant;
+mod holdings;
 mod limits;
-
+mod metrics;
 mod permit;
 mod pools;
 mod progress;
@@ -19,8 +22,8 @@ mod queue;
 mod sharing;
 
 pub use account::{Account, Client};
+pub use holdings::{ClientHoldings, EndedClient, ResourceUse};
 pub use limits::{LIMITS, Limit, WhenFull};
-
 pub use permit::{Permit, PermitHandle, PermitPool};
 pub use pools::Admission;
 pub use queue::{Queue, QueueMember, Units};

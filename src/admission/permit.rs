@@ -1,15 +1,16 @@
 //! Pools of permits.
 
 use std::sync::atomic::Ordering;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, Weak};
 use std::time::{Duration, Instant};
 
 use tokio::sync::Notify;
 
 use super::account::Account;
 use super::grant::{Grant, lock};
-use super::limits::Limit;
-use super::pools::{Admission, ResourceMetrics};
+use super::holdings::{EndedClient, PoolHolding, ResourceUse};
+use super::limits::{Limit, WhenFull};
+use super::metrics::ResourceMetrics;
 use super::sharing::{Decision, Holders, Share};
 use modalcast_model::error::{Error, Result};
 
@@ -20,9 +21,15 @@ const LOG_INTERVAL: Duration = Duration::from_secs(1);
 #[derive(Debug, Clone)]
 pub struct PermitPool(Arc<Shared>);
 
+/// Refers to a pool, and does not keep it.
+#[derive(Debug)]
+pub(super) struct WeakPermitPool(Weak<Shared>);
+
 #[derive(Debug)]
 struct Shared {
     limit: &'static Limit,
+    /// The scene of a pool that each scene has.
+    scene: Option<Arc<str>>,
     share: Share,
     metrics: ResourceMetrics,
     state: Mutex<State>,
@@ -56,16 +63,24 @@ pub struct PermitHandle {
     grant: Arc<Grant>,
 }
 
-impl Admission {
-    /// A pool of `total` permits that is counted here.
-    pub fn pool(&self, limit: &'static Limit, total: usize) -> PermitPool {
-        let share = Share { total, reserve: total / limit.reserve_divisor, when_full: limit.when_full };
-        let (metrics, state) = (self.of_resource(limit.resource), Mutex::default());
-        PermitPool(Arc::new(Shared { limit, share, metrics, state, released: Notify::new() }))
+impl WeakPermitPool {
+    /// `None` once the pool is dropped.
+    pub(super) fn upgrade(&self) -> Option<PermitPool> {
+        self.0.upgrade().map(PermitPool)
     }
 }
 
 impl PermitPool {
+    /// `scene` is that of a pool that each scene has.
+    pub(super) fn new(limit: &'static Limit, total: usize, scene: Option<Arc<str>>, metrics: ResourceMetrics) -> Self {
+        let share = Share { total, reserve: total / limit.reserve_divisor, when_full: limit.when_full };
+        Self(Arc::new(Shared { limit, scene, share, metrics, state: Mutex::default(), released: Notify::new() }))
+    }
+
+    pub(super) fn downgrade(&self) -> WeakPermitPool {
+        WeakPermitPool(Arc::downgrade(&self.0))
+    }
+
     /// Grants a permit that counts as one, if necessary after the preemption of another one.
     ///
     /// # Errors
@@ -126,6 +141,38 @@ impl PermitPool {
         }
     }
 
+    /// Ends the permits of some clients, with an error that says that an administrator has ended the client. Permits that are
+    /// never preempted stay. Returns the clients among those that hold permits.
+    pub(super) fn end_clients(&self, is_selected: impl Fn(&Account) -> bool) -> Vec<EndedClient> {
+        let mut state = lock(&self.0.state);
+        let is_preemptible = self.0.share.when_full == WhenFull::Preempt;
+        let (mut clients, mut ended) = (Vec::new(), Vec::new());
+        for (account, grants) in state.holders.clients().filter(|(account, _)| is_selected(account)) {
+            let grants = if is_preemptible { grants } else { &[] };
+            ended.extend(grants.iter().cloned());
+            clients.push(EndedClient { account, permits: grants.len() });
+        }
+        ended.iter().for_each(|grant| self.0.end(&mut state, grant, Error::ClientEnded));
+        clients
+    }
+
+    /// What each client holds.
+    pub(super) fn holdings(&self) -> Vec<PoolHolding> {
+        let state = lock(&self.0.state);
+        let holding = |(account, grants): (Account, &[Arc<Grant>])| PoolHolding {
+            held: self.0.resource_use(state.holders.held_by(&account)),
+            account,
+            granted_at: grants.iter().map(|grant| grant.granted_at()).min().unwrap_or(0),
+            last_progress: grants.iter().filter_map(|grant| grant.last_progress()).max(),
+        };
+        state.holders.clients().map(holding).collect()
+    }
+
+    /// What all clients hold together.
+    pub(super) fn resource_use(&self) -> ResourceUse {
+        self.0.resource_use(self.held())
+    }
+
     /// The limit on the amounts of all permits together.
     pub fn total(&self) -> usize {
         self.0.share.total
@@ -167,14 +214,22 @@ impl Shared {
     }
 
     fn preempt(&self, state: &mut State, victim: &Arc<Grant>) {
-        let account = lock(&victim.account).clone();
-        let held = state.holders.held_by(&account);
-        state.holders.remove(&account, victim);
-        state.ending += 1;
+        let held = state.holders.held_by(&lock(&victim.account));
         self.metrics.preempted.inc();
         let (objects, limit) = (self.limit.objects, self.share.total);
-        victim.preemption.send_replace(Some(Error::Preempted { objects, held, limit }));
+        self.end(state, victim, Error::Preempted { objects, held, limit });
         state.log.record(self.limit, limit);
+    }
+
+    /// Ends what a permit was granted for.
+    fn end(&self, state: &mut State, victim: &Arc<Grant>, error: Error) {
+        state.holders.remove(&lock(&victim.account), victim);
+        state.ending += 1;
+        victim.preemption.send_replace(Some(error));
+    }
+
+    fn resource_use(&self, held: usize) -> ResourceUse {
+        ResourceUse { limit: self.limit, scene: self.scene.clone(), held, total: self.share.total }
     }
 }
 
@@ -192,7 +247,7 @@ impl Permit {
     /// A permit of a pool of its own.
     #[cfg(test)]
     pub(crate) fn for_test(limit: &'static Limit) -> Self {
-        let pool = super::Admission::default().pool(limit, 1);
+        let pool = PermitPool::new(limit, 1, None, ResourceMetrics::default());
         pool.acquire(&Account::server()).expect("expected a free permit")
     }
 

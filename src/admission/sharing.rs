@@ -95,6 +95,15 @@ impl Holders {
         }
     }
 
+    /// Each client that holds anything, with its permits.
+    pub(super) fn clients(&self) -> impl Iterator<Item = (Account, &[Arc<Grant>])> {
+        self.principals.iter().flat_map(|(name, principal)| {
+            let account = move |client: &Client| Account { principal: name.clone(), client: *client };
+            let holders = principal.clients.iter().filter(|(_, holder)| holder.amount > 0);
+            holders.map(move |(client, holder)| (account(client), holder.grants.as_slice()))
+        })
+    }
+
     /// What a client holds.
     pub(super) fn held_by(&self, account: &Account) -> usize {
         let principal = self.principals.get(&account.principal);

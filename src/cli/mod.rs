@@ -196,6 +196,7 @@ fn exit_code(error: &Error) -> u8 {
         | Error::Busy { .. }
         | Error::LimitReached { .. }
         | Error::Preempted { .. }
+        | Error::ClientEnded
         | Error::OutOfMemory { .. }
         | Error::SlowReader { .. }
         | Error::SlowSubscriber { .. }

@@ -18,7 +18,7 @@ pub enum Role {
     Drive,
     /// Uploads scenes.
     Upload,
-    /// Administers the scenes of all principals.
+    /// Administers the scenes and the clients of all principals.
     Admin,
 }
 

@@ -82,6 +82,11 @@ impl ViewerSessions {
         Some(credential)
     }
 
+    /// Ends a session. Has no effect on calls that it has admitted.
+    pub fn end(&self, session: &TokenHash) {
+        take(&mut self.lock().sessions, *session);
+    }
+
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -136,6 +141,17 @@ mod tests {
         credential.revoke();
         assert_eq!(redeem(&sessions, &second), None);
         assert!(sessions.find(&session).is_none());
+    }
+
+    #[test]
+    fn ended_session_is_unknown() {
+        let sessions = ViewerSessions::default();
+        let [ended, other] = [(); 2].map(|()| {
+            let code = sessions.new_code(&credential()).expect("expected random numbers");
+            redeem(&sessions, &code).expect("expected a session")
+        });
+        sessions.end(&TokenHash::of(&ended).expect("expected a token"));
+        assert!(sessions.find(&ended).is_none() && sessions.find(&other).is_some());
     }
 
     #[test]

@@ -75,6 +75,9 @@ pub enum Error {
     /// objects.
     #[error("ended to make room for another client: this client held {held} of at most {limit} {objects}")]
     Preempted { objects: &'static str, held: usize, limit: usize },
+    /// An administrator has ended what the caller held.
+    #[error("an administrator has ended this client")]
+    ClientEnded,
     /// An object of a scene needs more memory than is left of a limit. `memory` names the limit. Nothing was allocated.
     #[error("{object}: expected at most {available} bytes ({memory}, in total {total}), got {asked}")]
     OutOfMemory { object: String, memory: &'static str, asked: u64, available: u64, total: u64 },

@@ -17,6 +17,7 @@ use tonic::body::Body;
 use tonic::codegen::http::{Request, Response};
 
 use super::authentication::Authenticator;
+use super::connected_peers::ConnectedPeerEntry;
 use super::connection::{Budgets, ConnectionInfo, STREAMS_PER_CONNECTION_WINDOW};
 use super::connection_gauges::ConnectionGauges;
 use super::connection_table::{ConnectionSlot, ConnectionTable, GOAWAY_TIMEOUT};
@@ -83,7 +84,10 @@ impl ConnectionServer {
         loop {
             match sockets.accept().await {
                 Ok((socket, peer)) => match table.insert(&self.account_of(&peer)).await {
-                    Ok(slot) => drop(tokio::spawn(Arc::clone(&self).serve(socket, peer, slot))),
+                    Ok(slot) => {
+                        let entry = table.peers().add(&peer, slot.permit());
+                        tokio::spawn(Arc::clone(&self).serve(socket, peer, slot, entry));
+                    }
                     Err(error) => tracing::debug!(peer = peer.name, %error, "a connection is refused"),
                 },
                 Err(error) => {
@@ -104,7 +108,7 @@ impl ConnectionServer {
     }
 
     /// Serves a connection until it ends or must be closed.
-    async fn serve(self: Arc<Self>, socket: Socket, peer: Peer, slot: ConnectionSlot) {
+    async fn serve(self: Arc<Self>, socket: Socket, peer: Peer, slot: ConnectionSlot, _entry: ConnectedPeerEntry) {
         tokio::select! {
             () = slot.overdue() => {}
             () = self.serve_until_retired(socket, peer, &slot) => {}

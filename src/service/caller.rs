@@ -46,6 +46,18 @@ impl Caller {
         Ok(Self { principal, credential, account, replies, peer })
     }
 
+    /// Logs the end of a client, or of several, and whether it has succeeded.
+    pub(super) fn log_ended_client<T>(&self, client: &str, result: Result<T, Status>) -> Result<T, Status> {
+        let (principal, peer, method) = (&self.principal.name, &self.peer, "EndClient");
+        match &result {
+            Ok(_) => tracing::info!(principal, peer, client, method, "ended"),
+            Err(status) => {
+                tracing::info!(principal, peer, client, method, code = ?status.code(), "not ended: {}", status.message());
+            }
+        }
+        result
+    }
+
     /// Logs a change of a scene, and whether it has succeeded.
     pub(super) fn log_change<T>(&self, method: &str, scene: &str, result: Result<T, Status>) -> Result<T, Status> {
         let (principal, peer) = (&self.principal.name, &self.peer);

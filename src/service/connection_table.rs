@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use tokio::sync::{Notify, watch};
 
+use super::connected_peers::ConnectedPeers;
 use super::open_calls::OpenCalls;
 use crate::admission::{Account, Admission, Limit, Permit, PermitHandle, PermitPool};
 use modalcast_model::error::Result;
@@ -21,6 +22,7 @@ pub(super) const GOAWAY_TIMEOUT: Duration = Duration::from_secs(1);
 #[derive(Debug)]
 pub(super) struct ConnectionTable {
     permits: PermitPool,
+    peers: Arc<ConnectedPeers>,
     /// Whether the server shuts down.
     is_retiring: watch::Sender<bool>,
 }
@@ -39,7 +41,12 @@ pub(super) struct ConnectionSlot {
 impl ConnectionTable {
     pub(super) fn new(max_connections: usize, admission: &Admission) -> Arc<Self> {
         let permits = admission.pool(Limit::CONNECTIONS, max_connections);
-        Arc::new(Self { permits, is_retiring: watch::Sender::new(false) })
+        Arc::new(Self { permits, peers: Arc::default(), is_retiring: watch::Sender::new(false) })
+    }
+
+    /// The other ends of the connections.
+    pub(super) const fn peers(&self) -> &Arc<ConnectedPeers> {
+        &self.peers
     }
 
     /// Adds a connection of a client, if necessary after the preemption of another one. Waits while too many preempted

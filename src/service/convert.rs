@@ -89,6 +89,8 @@ pub(super) fn wire_scene_summary(scene_handle: &SceneHandle) -> v1::SceneInfo {
         lighting: None,
         owner,
         shared_with: shared_with.into_iter().collect(),
+        writer: scene_handle.writer().map(|account| account.principal_name().to_owned()).unwrap_or_default(),
+        streams: scene_handle.subscription_count() as u32,
     }
 }
 

@@ -1,4 +1,4 @@
-//! `ServerService`: version, features, devices and limits of the server.
+//! `ServerService`: version, features, devices and limits of the server, links to its viewer, and its clients.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -6,10 +6,11 @@ use std::time::Duration;
 use modalcast_proto::v1;
 use tonic::{Request, Response, Status};
 
-use super::authentication::Authenticator;
 use super::caller::Caller;
+use super::clients::{ClientTable, MAX_LIST_BYTES};
 use super::connection::MAX_DRIVES;
 use super::status::to_status;
+use super::stream::respond_once;
 use crate::admission::Limit;
 use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
@@ -19,7 +20,7 @@ use modalcast_model::error::{Error, invalid};
 /// Implementation of `ServerService`.
 pub(super) struct ServerServiceImpl {
     pub(super) engine: Engine,
-    pub(super) authenticator: Arc<Authenticator>,
+    pub(super) clients: ClientTable,
     /// See `CreateViewerLinkResponse.urls`.
     pub(super) viewer_urls: Vec<String>,
 }
@@ -83,9 +84,29 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             true => credential,
             false => self.find_principal(&name, &principal).map_err(to_status)?,
         };
-        let url_path = self.authenticator.viewer_url_path(&credential).map_err(to_status)?;
+        let url_path = self.clients.authenticator.viewer_url_path(&credential).map_err(to_status)?;
         let public_url = self.engine.config().public_url.as_ref().map(ToString::to_string).unwrap_or_default();
         Ok(Response::new(v1::CreateViewerLinkResponse { url_path, urls: self.viewer_urls.clone(), public_url }))
+    }
+
+    async fn list_clients(
+        &self,
+        request: Request<v1::ListClientsRequest>,
+    ) -> Result<Response<v1::ListClientsResponse>, Status> {
+        let Caller { account, replies, .. } = Caller::of(&request)?;
+        let clients = self.clients.clone();
+        respond_once(replies, MAX_LIST_BYTES, async move { Ok(clients.list(&account)) }).await
+    }
+
+    async fn end_client(
+        &self,
+        request: Request<v1::EndClientRequest>,
+    ) -> Result<Response<v1::EndClientResponse>, Status> {
+        let caller = Caller::of(&request)?;
+        let id = request.into_inner().id;
+        let ended = self.clients.end(&id, &caller.account).map_err(to_status);
+        let ended = caller.log_ended_client(&id, ended)?;
+        Ok(Response::new(ended))
     }
 }
 
@@ -98,7 +119,7 @@ impl ServerServiceImpl {
             return Err(Error::NotPermitted { expected, given });
         }
         let unknown = || invalid("principal", "a principal of this server", format!("'{}'", name.escape_debug()));
-        self.authenticator.directory().find_name(name).ok_or_else(unknown)
+        self.clients.authenticator.directory().find_name(name).ok_or_else(unknown)
     }
 }
 

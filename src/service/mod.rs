@@ -5,6 +5,8 @@ mod accept;
 mod admin;
 mod authentication;
 mod caller;
+mod clients;
+mod connected_peers;
 mod connection;
 mod connection_gauges;
 mod connection_table;
@@ -54,7 +56,7 @@ pub use self::listen::{Listener, host_name};
 
 use self::accept::ConnectionServer;
 use self::admin::AdminServer;
-use self::authentication::Authenticator;
+use self::clients::ClientTable;
 use self::connection_gauges::ConnectionGauges;
 use self::connection_table::ConnectionTable;
 use self::routes::Routes;
@@ -96,7 +98,10 @@ pub async fn serve(
     let shared_memory = SharedMemory::default();
     let authenticator = Arc::clone(&listener.authenticator);
     let viewer_urls = [listener.viewer_urls(), listener.remote_viewer_urls()].concat();
-    let routes = routes(&engine, &config, &shared_memory, &authenticator, viewer_urls)?.with(health_server);
+    let table = ConnectionTable::new(config.connections, engine.admission());
+    let peers = Arc::clone(table.peers());
+    let clients = ClientTable { engine: engine.clone(), authenticator: Arc::clone(&authenticator), peers };
+    let routes = routes(&engine, &config, &shared_memory, clients, viewer_urls)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
     let web = config.viewer.then(|| {
         let host_name = host_name().filter(|_| accepts_machines);
@@ -121,7 +126,6 @@ pub async fn serve(
         let limit = Limit::SHARED_MEMORY;
         shared_memory.serve(socket, metrics.pool(limit, (limit.total)(&config)))
     });
-    let table = ConnectionTable::new(config.connections, metrics);
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {
@@ -234,7 +238,7 @@ fn routes(
     engine: &Engine,
     config: &Config,
     shared_memory: &SharedMemory,
-    authenticator: &Arc<Authenticator>,
+    clients: ClientTable,
     viewer_urls: Vec<String>,
 ) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
@@ -258,12 +262,12 @@ fn routes(
     let frame_service = frames::FrameServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let vertex_service = vertices::VertexServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let step_service = steps::StepServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
-    Ok(Routes::new(Arc::clone(authenticator), config.message_bytes)
+    Ok(Routes::new(Arc::clone(&clients.authenticator), config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
         .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
             engine: engine.clone(),
-            authenticator: Arc::clone(authenticator),
+            clients,
             viewer_urls,
         })))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))

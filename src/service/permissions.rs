@@ -12,9 +12,9 @@ pub(super) enum Requirement {
 }
 
 /// Every method of every service. A method that is not listed is denied.
-const METHODS: [(&str, Requirement); 28] = {
+const METHODS: [(&str, Requirement); 30] = {
     use Requirement::{Public, Role as Requires};
-    use Role::{Drive, Interact, Pixels, Upload, View};
+    use Role::{Admin, Drive, Interact, Pixels, Upload, View};
     [
         ("grpc.health.v1.Health/Check", Public),
         ("grpc.health.v1.Health/Watch", Requires(Pixels)),
@@ -44,6 +44,8 @@ const METHODS: [(&str, Requirement); 28] = {
         ("modalcast.v1.SceneService/FindUploadedFiles", Requires(Upload)),
         ("modalcast.v1.SceneService/UploadScene", Requires(Upload)),
         ("modalcast.v1.SceneService/UploadArrays", Requires(Upload)),
+        ("modalcast.v1.ServerService/ListClients", Requires(Admin)),
+        ("modalcast.v1.ServerService/EndClient", Requires(Admin)),
     ]
 };
 

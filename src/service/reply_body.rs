@@ -112,6 +112,7 @@ replies_without_data! {
     DeleteSceneResponse
     DriveSceneResponse
     FindUploadedFilesResponse
+    ListClientsResponse
     ListScenesResponse
     OpenSceneResponse
     PickResponse

@@ -109,6 +109,7 @@ impl ErrorReport {
             | Error::Busy { .. }
             | Error::LimitReached { .. }
             | Error::Preempted { .. }
+            | Error::ClientEnded
             | Error::OutOfMemory { .. }
             | Error::SlowReader { .. }
             | Error::SlowSubscriber { .. }) => Self::of_exhausted(exhausted),
@@ -161,6 +162,10 @@ impl ErrorReport {
                     ("held", held.to_string()),
                     ("limit", limit.to_string()),
                 ])
+            }
+            Error::ClientEnded => {
+                let (expected, given) = ("a client that is not ended", "one that an administrator has ended");
+                Self::new(Code::ResourceExhausted, Reason::EndedByAdministrator, expected, given)
             }
             Error::OutOfMemory { object, memory, asked, available, total } => {
                 let expected = format!("at most {available} bytes of the {memory}");

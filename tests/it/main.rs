@@ -6,6 +6,7 @@ mod attribute_streams;
 mod broken_streams;
 mod budgets;
 mod bulk_steps;
+mod clients;
 mod commands;
 #[path = "../common/mod.rs"]
 mod common;

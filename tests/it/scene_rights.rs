@@ -84,13 +84,15 @@ fn calls() -> Vec<(&'static str, Vec<u8>, Right)> {
 }
 
 /// Methods without the name of an existing scene.
-const WITHOUT_SCENE: [&str; 11] = [
+const WITHOUT_SCENE: [&str; 13] = [
     "grpc.health.v1.Health/Check",
     "grpc.health.v1.Health/Watch",
     "grpc.reflection.v1.ServerReflection/ServerReflectionInfo",
     "grpc.reflection.v1alpha.ServerReflection/ServerReflectionInfo",
     "modalcast.v1.ServerService/GetServerInfo",
     "modalcast.v1.ServerService/CreateViewerLink",
+    "modalcast.v1.ServerService/ListClients",
+    "modalcast.v1.ServerService/EndClient",
     "modalcast.v1.SceneService/ListScenes",
     "modalcast.v1.SceneService/OpenScene",
     "modalcast.v1.SceneService/FindUploadedFiles",

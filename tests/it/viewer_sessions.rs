@@ -102,6 +102,25 @@ async fn only_admins_make_links_for_others() {
     own.expect("expected a link to the own principal");
 }
 
+/// Its page would connect again with the same session.
+#[tokio::test(flavor = "multi_thread")]
+async fn session_ends_when_an_administrator_ends_its_client() {
+    let guarded = GuardedServer::start().await;
+    let session = new_session(&guarded, Role::View).await;
+    let mut websocket = WebSocketClient::connect(&guarded.server).await;
+    websocket.send(0, SESSION, session.as_bytes()).await;
+    assert_eq!(call(&mut websocket, LIST).await, Code::Ok);
+    let admin = client(&guarded, Role::Admin).await;
+    let clients = admin.list_clients().await.expect("expected the rights of an administrator").clients;
+    let listed = clients.iter().find(|client| client.kind() == v1::ClientKind::Session).expect("expected a session");
+    assert!(listed.id.starts_with("view/session-") && listed.address.starts_with("127.0.0.1:"), "{listed:?}");
+    admin.end_client(&listed.id).await.expect("expected the end of the session");
+    assert_eq!(websocket.closed().await, Some(1001));
+    let mut second = WebSocketClient::connect(&guarded.server).await;
+    second.send(0, SESSION, session.as_bytes()).await;
+    assert_eq!(second.closed().await, Some(4003));
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn session_ends_with_the_credential_of_its_link() {
     let guarded = GuardedServer::start().await;

@@ -93,6 +93,7 @@ const fn reason_exit_code(reason: Reason) -> u8 {
         | Reason::QueueFull
         | Reason::LimitReached
         | Reason::Preempted
+        | Reason::EndedByAdministrator
         | Reason::OutOfMemory
         | Reason::SlowReader
         | Reason::Unauthenticated

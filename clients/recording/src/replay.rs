@@ -130,6 +130,8 @@ fn without_usage(info: SceneInfo) -> SceneInfo {
         remarks: Vec::new(),
         owner: String::new(),
         shared_with: Vec::new(),
+        writer: String::new(),
+        streams: 0,
         ..info
     }
 }

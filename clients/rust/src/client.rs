@@ -237,6 +237,26 @@ impl Client {
         self.reply(service.create_viewer_link(request).await)
     }
 
+    /// Lists the clients of the server with what they hold of limited resources. Those that hold the largest part of a
+    /// limit come first. Needs the role `admin`.
+    ///
+    /// # Errors
+    /// `Status` if the caller has another role; `Connect` if the connection is lost.
+    pub async fn list_clients(&self) -> Result<v1::ListClientsResponse> {
+        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
+        self.reply(service.list_clients(v1::ListClientsRequest {}).await)
+    }
+
+    /// Ends the connections, streams and waiting requests of a client, by its id in [`Self::list_clients`], or of all clients
+    /// of a principal except this one: `"anna/*"`. Their open scenes stay open. Needs the role `admin`.
+    ///
+    /// # Errors
+    /// `Status` if no such client holds anything or the caller has another role; `Connect` if the connection is lost.
+    pub async fn end_client(&self, id: &str) -> Result<v1::EndClientResponse> {
+        let mut service = v1::server_service_client::ServerServiceClient::new(self.channel.clone());
+        self.reply(service.end_client(v1::EndClientRequest { id: id.to_owned() }).await)
+    }
+
     /// Shares a scene with the principals of these names (`"*"`: all), in place of those with whom it was shared. Others
     /// than its owner do not see a scene that is not shared.
     ///

@@ -108,8 +108,8 @@ impl SceneHandle {
         let wake = Arc::new(Notify::new());
         let max_window = services.config.max_window;
         let (admission, config) = (&services.admission, &services.config);
-        let subscriptions = admission.pool(Limit::SUBSCRIPTIONS, config.max_subscribers);
-        let waiting_requests = admission.pool(Limit::WAITING_REQUESTS, config.max_pending_requests);
+        let subscriptions = admission.pool_of_scene(Limit::SUBSCRIPTIONS, config.max_subscribers, &name);
+        let waiting_requests = admission.pool_of_scene(Limit::WAITING_REQUESTS, config.max_pending_requests, &name);
         let failure = Arc::new(OnceLock::new());
         let checkpoints = SceneCheckpoints::new(Arc::clone(&services.checkpoints), name.clone());
         let (state_sender, current_state) = watch::channel(Arc::clone(&state));

@@ -35,7 +35,7 @@ impl Metrics {
         registry.register("connections", "Open connections after their first bytes", connections.family());
         let help = "Calls without a known credential, and calls that the role does not permit";
         registry.register("auth_failures", help, auth_failures);
-        let Admission { refused, preempted } = engine.admission().clone();
+        let Admission { refused, preempted, .. } = engine.admission().clone();
         registry.register("refused", "Clients that were refused, because they hold their share", refused);
         registry.register("preempted", "What was ended to make room for other clients", preempted);
         let memory = Family::<[(&'static str, &'static str); 2], Gauge>::default();

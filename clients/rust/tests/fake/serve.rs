@@ -86,6 +86,22 @@ impl ServerService for FakeService {
         Ok(Response::new(v1::CreateViewerLinkResponse { url_path, ..Default::default() }))
     }
 
+    async fn list_clients(
+        &self,
+        _: Request<v1::ListClientsRequest>,
+    ) -> Result<Response<v1::ListClientsResponse>, Status> {
+        let client = v1::ClientInfo { id: "owner/connection-0".into(), is_caller: true, ..Default::default() };
+        Ok(Response::new(v1::ListClientsResponse { clients: vec![client], ..Default::default() }))
+    }
+
+    /// Ends one connection of the client.
+    async fn end_client(
+        &self,
+        request: Request<v1::EndClientRequest>,
+    ) -> Result<Response<v1::EndClientResponse>, Status> {
+        Ok(Response::new(v1::EndClientResponse { ids: vec![request.into_inner().id], ended: 1 }))
+    }
+
     async fn get_server_info(
         &self,
         _: Request<v1::GetServerInfoRequest>,
