@@ -60,6 +60,9 @@ enum Command {
     /// Prints a link to the viewer of a running server, which is valid once.
     #[command(after_help = LINK_EXAMPLES, disable_help_flag = true)]
     Link(sibling::Args),
+    /// Lists the clients of a running server with what they hold, or ends them.
+    #[command(after_help = CLIENTS_EXAMPLES, disable_help_flag = true)]
+    Clients(sibling::Args),
     /// Shares a scene of a running server with other principals.
     #[command(after_help = SHARE_EXAMPLES, disable_help_flag = true)]
     Share(sibling::Args),
@@ -95,6 +98,11 @@ const LINK_EXAMPLES: &str = "Examples:
   modalcast link
   modalcast link anna
   modalcast link --scene tree --server http://127.0.0.1:50051";
+
+const CLIENTS_EXAMPLES: &str = "Examples:
+  modalcast clients
+  modalcast clients --end anna/process-4711
+  modalcast clients --end 'anonymous/*'";
 
 const SHARE_EXAMPLES: &str = "Examples:
   modalcast share tree anna ben
@@ -164,6 +172,7 @@ pub fn run() -> u8 {
         Command::Inspect(args) => inspect::run(&args),
         Command::Token(args) => token::run(&args),
         Command::Link(args) => sibling::FETCH.execute(Some("link"), &args),
+        Command::Clients(args) => sibling::FETCH.execute(Some("clients"), &args),
         Command::Share(args) => sibling::FETCH.execute(Some("share"), &args),
         Command::Doctor(args) => doctor::run(&args),
     };

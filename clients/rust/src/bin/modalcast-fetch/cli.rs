@@ -21,7 +21,17 @@ subscription. The program then receives every step of a physics process that sta
 Exit codes: 0 done; 1 rejected by the server; 2 invalid command line; 3 connection failed or lost; 4 local file error;
 5 malformed, truncated or late reply.";
 
-/// Saves frames or vertices from a modalcast server, prints its scenes and settings, and resets or closes scenes.
+const CLIENTS_EXAMPLES: &str = "\
+Examples:
+  modalcast clients
+  modalcast clients --json
+  modalcast clients --end anna/process-4711
+  modalcast clients --end 'anonymous/*' --server unix:/srv/modalcast/server.sock
+
+SHARE is the largest part of a limit that the client holds, FOR the time for which it holds something, and IDLE the time
+since its last step, reply or frame.";
+
+/// Saves frames or vertices from a modalcast server, prints its scenes, settings and clients, and resets or closes scenes.
 #[derive(Debug, Parser)]
 #[command(name = "modalcast-fetch", version, after_help = EXAMPLES)]
 pub(crate) struct Cli {
@@ -57,6 +67,9 @@ pub(crate) enum Command {
     Info,
     /// List the open scenes and the sources that can be opened.
     List,
+    /// List the clients with what they hold of limited resources, or end some. Needs the role `admin`.
+    #[command(after_help = CLIENTS_EXAMPLES)]
+    Clients(ClientsOptions),
     /// Return a scene to its rest state.
     Reset {
         /// The scene's name on the server.
@@ -88,6 +101,17 @@ pub(crate) enum Command {
         #[arg(long)]
         scene: String,
     },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ClientsOptions {
+    /// End the connections, streams and waiting requests of a client, by its id in the list, or of all clients of a
+    /// principal except this command: 'anna/*'. Open scenes stay open.
+    #[arg(long, value_name = "ID", conflicts_with = "all")]
+    pub(crate) end: Vec<String>,
+    /// Show all clients. Without this option, the table shows ten of each principal.
+    #[arg(long)]
+    pub(crate) all: bool,
 }
 
 /// Options that select the scene.

@@ -1,7 +1,8 @@
-//! `modalcast-fetch` saves frames and vertices of a server as files. It prints progress on standard error and results
-//! on standard output.
+//! `modalcast-fetch` saves frames and vertices of a server as files, and administers its scenes and clients. It prints
+//! progress on standard error and results on standard output.
 
 mod cli;
+mod clients;
 mod frames;
 mod output;
 mod vertices;
@@ -30,6 +31,7 @@ async fn run_command(arguments: &Cli) -> Result<()> {
         Command::Frame(options) => frames::fetch_single(&client, options, as_json).await,
         Command::Vertices(options) => vertices::fetch(&client, options, as_json).await,
         Command::Info => output::print_info(&client, as_json).await,
+        Command::Clients(options) => clients::run(&client, options, as_json).await,
         Command::List => output::print_list(&client, as_json).await,
         Command::Reset { scene, take_over } => client.reset_scene(scene, *take_over).await.map(drop),
         Command::Close { scene } => client.delete_scene(scene).await,

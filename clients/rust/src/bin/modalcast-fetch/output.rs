@@ -190,10 +190,11 @@ pub(crate) async fn print_list(client: &Client, as_json: bool) -> Result<()> {
     for scene in scenes {
         let last_step =
             scene.last_step.map_or("no step yet".into(), |step| format!("step {} of run {}", step.number, step.run));
-        let SceneInfo { scene: name, source, domains, vertices, triangles, coordinates, .. } = scene;
+        let writer = if scene.writer.is_empty() { "not driven".into() } else { format!("driven by {}", scene.writer) };
+        let SceneInfo { scene: name, source, domains, vertices, triangles, coordinates, streams, .. } = scene;
         println!(
             "{name} ({source}): {domains} domains, {vertices} vertices, {triangles} triangles, {coordinates} \
-             coordinates, {last_step}"
+             coordinates, {last_step}, {writer}, {streams} streams"
         );
     }
     for source in sources {
@@ -208,7 +209,8 @@ fn scene_json(scene: &SceneInfo) -> Value {
         "scene": scene.scene, "source": scene.source, "domains": scene.domains, "vertices": scene.vertices,
         "corners": scene.corners, "triangles": scene.triangles, "coordinates": scene.coordinates, "up": scene.up,
         "unit": scene.unit, "origin": scene.origin, "bounds": scene.bounds, "last_step": last_step,
-        "remarks": scene.remarks,
+        "remarks": scene.remarks, "owner": scene.owner, "shared_with": scene.shared_with, "writer": scene.writer,
+        "streams": scene.streams,
     })
 }
 
