@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from scenes import beam_builder
@@ -10,6 +12,8 @@ from scenes import beam_builder
 import modalcast as mc
 
 SERVER_ARGUMENTS = ["--backend", "cpu", "--renderer", "software"]
+
+TOKEN = "token-of-anna"
 
 
 @pytest.fixture(scope="session")
@@ -21,6 +25,16 @@ def client() -> Iterator[mc.Client]:
 @pytest.fixture(scope="session")
 def tree(client: mc.Client) -> mc.Scene:
     return client.open("tree")
+
+
+@pytest.fixture
+def principals(tmp_path: Path) -> Path:
+    """A file with the principal "anna"."""
+    path = tmp_path / "principals.toml"
+    digits = hashlib.sha256(TOKEN.encode()).hexdigest()
+    path.write_text(f'[[principal]]\nname = "anna"\nrole = "upload"\n[[principal.token]]\nsha256 = "{digits}"\n')
+    path.chmod(0o600)
+    return path
 
 
 @pytest.fixture

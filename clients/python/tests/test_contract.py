@@ -149,6 +149,9 @@ def use_steps(scene: mc.Scene) -> None:
 
 def use_every_call(client: mc.Client, folder: Path) -> None:
     assert "tree" in client.scenes().sources
+    assert any(listed.is_caller for listed in client.clients())
+    with pytest.raises(mc.InvalidRequest):
+        client.end_client("nobody/*")
     tree = client.open("tree")
     tree.describe(["uvs"], textures=True)
     tree.modes("trunk", [0])
@@ -185,5 +188,6 @@ def test_every_call_and_message_of_the_contract_is_used(
         return {message.full_name for message in messages.values()}
 
     expected_messages = set[str]().union(*(names(dict(file.message_types_by_name)) for file in FILES))
-    # This client does not use shared memory, and no scene of the server fails.
-    assert expected_messages - recorder.messages == {"modalcast.v1.SharedRange", "modalcast.v1.FailedScene"}
+    # This client uses no shared memory and ends no other one, and no scene of the server fails.
+    unused = {"SharedRange", "FailedScene", "EndClientResponse"}
+    assert expected_messages - recorder.messages == {f"modalcast.v1.{name}" for name in unused}

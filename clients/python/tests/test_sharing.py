@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 import pytest
-from conftest import SERVER_ARGUMENTS
+from conftest import SERVER_ARGUMENTS, TOKEN
 
 import modalcast as mc
-
-TOKEN = "token-of-anna"
-
-
-@pytest.fixture
-def principals(tmp_path: Path) -> Path:
-    """A file with the principal "anna"."""
-    path = tmp_path / "principals.toml"
-    digits = hashlib.sha256(TOKEN.encode()).hexdigest()
-    path.write_text(f'[[principal]]\nname = "anna"\nrole = "upload"\n[[principal.token]]\nsha256 = "{digits}"\n')
-    path.chmod(0o600)
-    return path
 
 
 def test_scene_is_used_by_those_with_whom_it_is_shared(principals: Path):

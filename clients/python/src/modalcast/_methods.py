@@ -43,6 +43,8 @@ GET_SERVER_INFO = _method(
 CREATE_VIEWER_LINK = _method(
     "ServerService/CreateViewerLink", server_pb2.CreateViewerLinkRequest, server_pb2.CreateViewerLinkResponse
 )
+LIST_CLIENTS = _method("ServerService/ListClients", server_pb2.ListClientsRequest, server_pb2.ListClientsResponse)
+END_CLIENT = _method("ServerService/EndClient", server_pb2.EndClientRequest, server_pb2.EndClientResponse)
 OPEN_SCENE = _method("SceneService/OpenScene", scenes_pb2.OpenSceneRequest, scenes_pb2.OpenSceneResponse)
 UPLOAD_SCENE = _method("SceneService/UploadScene", scenes_pb2.UploadSceneRequest, scenes_pb2.UploadSceneResponse)
 UPLOAD_ARRAYS = _method("SceneService/UploadArrays", scenes_pb2.UploadArraysRequest, scenes_pb2.UploadArraysResponse)

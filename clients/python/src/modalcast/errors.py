@@ -97,7 +97,7 @@ class StepPassed(ServerError):
 
 
 class LimitReached(ServerError):
-    """A queue or a limit of the server is exhausted, or this client read too slowly."""
+    """A queue or a limit of the server is exhausted, this client read too slowly, or an administrator has ended it."""
 
 
 class DeadlineExceeded(ServerError, TimeoutError):

@@ -17,8 +17,10 @@ from modalcast._async.transport import RETRY_SECONDS, Transport, sleep
 from modalcast._channel import ConnectOptions, default_address
 from modalcast._methods import (
     DELETE_SCENE,
+    END_CLIENT,
     FIND_UPLOADED_FILES,
     GET_SERVER_INFO,
+    LIST_CLIENTS,
     LIST_SCENES,
     OPEN_SCENE,
     PROTOCOL_VERSION,
@@ -252,6 +254,44 @@ class Client:
         except NotFound:
             if not missing_ok:
                 raise
+
+    async def clients(self, *, timeout: float | None = None) -> list[server_pb2.ClientInfo]:
+        """Lists the clients of the server with what they hold of limited resources, for administrators.
+
+        Those that hold the largest part of a limit come first. `server.proto` documents the fields. A list that would
+        be longer than 1 MiB ends before the clients that hold the smallest parts.
+
+        Raises:
+            PermissionDenied: Your role is not `admin`.
+            Error: The call failed.
+        """
+        timeout = self._timeout if timeout is None else timeout
+        request = server_pb2.ListClientsRequest()
+        reply = await with_reconnect(
+            self._transport, self._reconnect, lambda: self._transport.unary(LIST_CLIENTS, request, timeout)
+        )
+        return list(reply.clients)
+
+    async def end_client(self, client_id: str, *, timeout: float | None = None) -> int:
+        """Ends the connections, streams and waiting requests of a client, for administrators. Open scenes stay open.
+
+        The client may connect again if its credential is still valid; the session of a browser is not.
+
+        Args:
+            client_id: The id of a client in `clients`, or all clients of a principal except this one: "anna/*".
+            timeout: In seconds; None: that of the client.
+
+        Returns:
+            The number of connections, streams and waiting requests that end.
+
+        Raises:
+            InvalidRequest: No client with this id holds anything.
+            PermissionDenied: Your role is not `admin`.
+            Error: The call failed.
+        """
+        request = server_pb2.EndClientRequest(id=client_id)
+        timeout = self._timeout if timeout is None else timeout
+        return (await self._transport.unary(END_CLIENT, request, timeout)).ended
 
     async def close(self) -> None:
         """Closes the connection, and ends a server that `spawn` has started."""

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/errors.proto\x12\x0cmodalcast.v1\"}\n\tRejection\x12\x11\n\x04step\x18\x01 \x01(\x04H\x00\x88\x01\x01\x12$\n\x06reason\x18\x02 \x01(\x0e\x32\x14.modalcast.v1.Reason\x12\r\n\x05\x66ield\x18\x03 \x01(\t\x12\x10\n\x08\x65xpected\x18\x04 \x01(\t\x12\r\n\x05given\x18\x05 \x01(\tB\x07\n\x05_step*\x9e\x05\n\x06Reason\x12\x16\n\x12REASON_UNSPECIFIED\x10\x00\x12\x18\n\x14REASON_INVALID_FIELD\x10\x01\x12\x1d\n\x19REASON_UNEXPECTED_MESSAGE\x10\x02\x12\x17\n\x13REASON_INVALID_FILE\x10\x03\x12\x1a\n\x16REASON_SCENE_NOT_FOUND\x10\x04\x12\x1b\n\x17REASON_SCENE_NAME_TAKEN\x10\x05\x12\x1d\n\x19REASON_WRITER_LEASE_TAKEN\x10\x06\x12\x16\n\x12REASON_STEP_PASSED\x10\x07\x12\x16\n\x12REASON_WINDOW_FULL\x10\x08\x12\x15\n\x11REASON_QUEUE_FULL\x10\t\x12\x18\n\x14REASON_LIMIT_REACHED\x10\n\x12\x1c\n\x18REASON_MESSAGE_TOO_LARGE\x10\x0b\x12\x16\n\x12REASON_SLOW_READER\x10\x0c\x12\x1b\n\x17REASON_DEADLINE_EXPIRED\x10\r\x12\x1b\n\x17REASON_RESOURCE_MISSING\x10\x0e\x12\x18\n\x14REASON_SHUTTING_DOWN\x10\x0f\x12\x16\n\x12REASON_DEVICE_LOST\x10\x10\x12\x13\n\x0fREASON_INTERNAL\x10\x11\x12\x15\n\x11REASON_LEASE_LOST\x10\x12\x12\x1b\n\x17REASON_STREAM_NOT_FOUND\x10\x13\x12\x1c\n\x18REASON_CONTENT_NOT_FOUND\x10\x14\x12\x18\n\x14REASON_OUT_OF_MEMORY\x10\x15\x12\x1a\n\x16REASON_UNAUTHENTICATED\x10\x16\x12\x1c\n\x18REASON_PERMISSION_DENIED\x10\x17\x12\x14\n\x10REASON_PREEMPTED\x10\x18\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/errors.proto\x12\x0cmodalcast.v1\"}\n\tRejection\x12\x11\n\x04step\x18\x01 \x01(\x04H\x00\x88\x01\x01\x12$\n\x06reason\x18\x02 \x01(\x0e\x32\x14.modalcast.v1.Reason\x12\r\n\x05\x66ield\x18\x03 \x01(\t\x12\x10\n\x08\x65xpected\x18\x04 \x01(\t\x12\r\n\x05given\x18\x05 \x01(\tB\x07\n\x05_step*\xc1\x05\n\x06Reason\x12\x16\n\x12REASON_UNSPECIFIED\x10\x00\x12\x18\n\x14REASON_INVALID_FIELD\x10\x01\x12\x1d\n\x19REASON_UNEXPECTED_MESSAGE\x10\x02\x12\x17\n\x13REASON_INVALID_FILE\x10\x03\x12\x1a\n\x16REASON_SCENE_NOT_FOUND\x10\x04\x12\x1b\n\x17REASON_SCENE_NAME_TAKEN\x10\x05\x12\x1d\n\x19REASON_WRITER_LEASE_TAKEN\x10\x06\x12\x16\n\x12REASON_STEP_PASSED\x10\x07\x12\x16\n\x12REASON_WINDOW_FULL\x10\x08\x12\x15\n\x11REASON_QUEUE_FULL\x10\t\x12\x18\n\x14REASON_LIMIT_REACHED\x10\n\x12\x1c\n\x18REASON_MESSAGE_TOO_LARGE\x10\x0b\x12\x16\n\x12REASON_SLOW_READER\x10\x0c\x12\x1b\n\x17REASON_DEADLINE_EXPIRED\x10\r\x12\x1b\n\x17REASON_RESOURCE_MISSING\x10\x0e\x12\x18\n\x14REASON_SHUTTING_DOWN\x10\x0f\x12\x16\n\x12REASON_DEVICE_LOST\x10\x10\x12\x13\n\x0fREASON_INTERNAL\x10\x11\x12\x15\n\x11REASON_LEASE_LOST\x10\x12\x12\x1b\n\x17REASON_STREAM_NOT_FOUND\x10\x13\x12\x1c\n\x18REASON_CONTENT_NOT_FOUND\x10\x14\x12\x18\n\x14REASON_OUT_OF_MEMORY\x10\x15\x12\x1a\n\x16REASON_UNAUTHENTICATED\x10\x16\x12\x1c\n\x18REASON_PERMISSION_DENIED\x10\x17\x12\x14\n\x10REASON_PREEMPTED\x10\x18\x12!\n\x1dREASON_ENDED_BY_ADMINISTRATOR\x10\x19\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,7 +32,7 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'modalcast.v1.errors_pb2', _
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_REASON']._serialized_start=171
-  _globals['_REASON']._serialized_end=841
+  _globals['_REASON']._serialized_end=876
   _globals['_REJECTION']._serialized_start=43
   _globals['_REJECTION']._serialized_end=168
 # @@protoc_insertion_point(module_scope)

@@ -32,6 +32,7 @@ class Reason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REASON_UNAUTHENTICATED: _ClassVar[Reason]
     REASON_PERMISSION_DENIED: _ClassVar[Reason]
     REASON_PREEMPTED: _ClassVar[Reason]
+    REASON_ENDED_BY_ADMINISTRATOR: _ClassVar[Reason]
 REASON_UNSPECIFIED: Reason
 REASON_INVALID_FIELD: Reason
 REASON_UNEXPECTED_MESSAGE: Reason
@@ -57,6 +58,7 @@ REASON_OUT_OF_MEMORY: Reason
 REASON_UNAUTHENTICATED: Reason
 REASON_PERMISSION_DENIED: Reason
 REASON_PREEMPTED: Reason
+REASON_ENDED_BY_ADMINISTRATOR: Reason
 
 class Rejection(_message.Message):
     __slots__ = ("step", "reason", "field", "expected", "given")

@@ -65,7 +65,7 @@ class OpenSceneResponse(_message.Message):
     def __init__(self, scene: _Optional[_Union[SceneInfo, _Mapping]] = ...) -> None: ...
 
 class SceneInfo(_message.Message):
-    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting", "durable_step", "owner", "shared_with")
+    __slots__ = ("scene", "source", "domains", "vertices", "corners", "triangles", "coordinates", "up", "unit", "origin", "bounds", "affine", "last_step", "remarks", "lighting", "durable_step", "owner", "shared_with", "writer", "streams")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     DOMAINS_FIELD_NUMBER: _ClassVar[int]
@@ -84,6 +84,8 @@ class SceneInfo(_message.Message):
     DURABLE_STEP_FIELD_NUMBER: _ClassVar[int]
     OWNER_FIELD_NUMBER: _ClassVar[int]
     SHARED_WITH_FIELD_NUMBER: _ClassVar[int]
+    WRITER_FIELD_NUMBER: _ClassVar[int]
+    STREAMS_FIELD_NUMBER: _ClassVar[int]
     scene: str
     source: str
     domains: int
@@ -102,7 +104,9 @@ class SceneInfo(_message.Message):
     durable_step: _common_pb2.StepId
     owner: str
     shared_with: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., owner: _Optional[str] = ..., shared_with: _Optional[_Iterable[str]] = ...) -> None: ...
+    writer: str
+    streams: int
+    def __init__(self, scene: _Optional[str] = ..., source: _Optional[str] = ..., domains: _Optional[int] = ..., vertices: _Optional[int] = ..., corners: _Optional[int] = ..., triangles: _Optional[int] = ..., coordinates: _Optional[int] = ..., up: _Optional[str] = ..., unit: _Optional[float] = ..., origin: _Optional[_Iterable[float]] = ..., bounds: _Optional[_Iterable[float]] = ..., affine: bool = ..., last_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., remarks: _Optional[_Iterable[str]] = ..., lighting: _Optional[_Union[Lighting, _Mapping]] = ..., durable_step: _Optional[_Union[_common_pb2.StepId, _Mapping]] = ..., owner: _Optional[str] = ..., shared_with: _Optional[_Iterable[str]] = ..., writer: _Optional[str] = ..., streams: _Optional[int] = ...) -> None: ...
 
 class Lighting(_message.Message):
     __slots__ = ("to_sun", "sunlight", "skylight", "zenith", "horizon", "ground", "shadows", "exposure", "tone_mapping", "ambient_cube", "fill", "ambient_occlusion_radius")

@@ -24,25 +24,39 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/server.proto\x12\x0cmodalcast.v1\"\x16\n\x14GetServerInfoRequest\",\n\x17\x43reateViewerLinkRequest\x12\x11\n\tprincipal\x18\x01 \x01(\t\"N\n\x18\x43reateViewerLinkResponse\x12\x10\n\x08url_path\x18\x01 \x01(\t\x12\x0c\n\x04urls\x18\x02 \x03(\t\x12\x12\n\npublic_url\x18\x03 \x01(\t\"\xef\x01\n\x15GetServerInfoResponse\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\x0f\n\x07\x62\x61\x63kend\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65vice\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\x10\n\x08software\x18\x05 \x01(\x08\x12$\n\x06limits\x18\x06 \x01(\x0b\x32\x14.modalcast.v1.Limits\x12\x18\n\x10protocol_version\x18\x07 \x01(\r\x12\'\n\x08\x66\x65\x61tures\x18\x08 \x03(\x0e\x32\x15.modalcast.v1.Feature\x12\x17\n\x0fviewer_url_path\x18\t \x01(\t\"\xa6\x03\n\x06Limits\x12\x15\n\rmessage_bytes\x18\x01 \x01(\x04\x12\x12\n\nframe_side\x18\x02 \x01(\r\x12\x0e\n\x06scenes\x18\x03 \x01(\r\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x14\n\x0cupload_bytes\x18\x05 \x01(\x04\x12\x13\n\x0b\x64\x65\x61\x64line_ms\x18\x06 \x01(\r\x12\x0e\n\x06\x64rives\x18\x07 \x01(\r\x12 \n\x18\x63onnection_receive_bytes\x18\x08 \x01(\x04\x12\x1a\n\x12message_timeout_ms\x18\t \x01(\r\x12\x1e\n\x16\x63onnection_reply_bytes\x18\n \x01(\x04\x12\x18\n\x10reply_timeout_ms\x18\x0b \x01(\r\x12\x18\n\x10scene_host_bytes\x18\x0c \x01(\x04\x12\x1a\n\x12scene_device_bytes\x18\r \x01(\x04\x12\x1b\n\x13render_target_bytes\x18\x0e \x01(\x04\x12\x15\n\rclient_scenes\x18\x0f \x01(\r\x12\x1b\n\x13\x63lient_upload_bytes\x18\x10 \x01(\x04\x12\x17\n\x0fstall_budget_ms\x18\x11 \x01(\r*\xe4\x01\n\x07\x46\x65\x61ture\x12\x17\n\x13\x46\x45\x41TURE_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x46\x45\x41TURE_FRAMES\x10\x01\x12\x1a\n\x16\x46\x45\x41TURE_CONTENT_HASHES\x10\x02\x12\x18\n\x14\x46\x45\x41TURE_UPLOAD_REUSE\x10\x03\x12\x19\n\x15\x46\x45\x41TURE_UPLOAD_ARRAYS\x10\x04\x12\x19\n\x15\x46\x45\x41TURE_SHARED_MEMORY\x10\x05\x12\x12\n\x0e\x46\x45\x41TURE_VIEWER\x10\x06\x12\x14\n\x10\x46\x45\x41TURE_PACKED_Q\x10\x07\x12\x16\n\x12\x46\x45\x41TURE_RGB_FRAMES\x10\x08\x32\xcc\x01\n\rServerService\x12X\n\rGetServerInfo\x12\".modalcast.v1.GetServerInfoRequest\x1a#.modalcast.v1.GetServerInfoResponse\x12\x61\n\x10\x43reateViewerLink\x12%.modalcast.v1.CreateViewerLinkRequest\x1a&.modalcast.v1.CreateViewerLinkResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19modalcast/v1/server.proto\x12\x0cmodalcast.v1\"\x16\n\x14GetServerInfoRequest\",\n\x17\x43reateViewerLinkRequest\x12\x11\n\tprincipal\x18\x01 \x01(\t\"N\n\x18\x43reateViewerLinkResponse\x12\x10\n\x08url_path\x18\x01 \x01(\t\x12\x0c\n\x04urls\x18\x02 \x03(\t\x12\x12\n\npublic_url\x18\x03 \x01(\t\"\x14\n\x12ListClientsRequest\"\x7f\n\x13ListClientsResponse\x12)\n\x07\x63lients\x18\x01 \x03(\x0b\x32\x18.modalcast.v1.ClientInfo\x12\x0f\n\x07omitted\x18\x02 \x01(\r\x12,\n\tresources\x18\x03 \x03(\x0b\x32\x19.modalcast.v1.ResourceUse\"\x93\x02\n\nClientInfo\x12\n\n\x02id\x18\x01 \x01(\t\x12\x11\n\tprincipal\x18\x02 \x01(\t\x12&\n\x04kind\x18\x03 \x01(\x0e\x32\x18.modalcast.v1.ClientKind\x12\x0f\n\x07\x61\x64\x64ress\x18\x04 \x01(\t\x12\x12\n\nprocess_id\x18\x05 \x01(\r\x12\x14\n\x0cprocess_name\x18\x06 \x01(\t\x12\'\n\x04held\x18\x07 \x03(\x0b\x32\x19.modalcast.v1.ResourceUse\x12\x0e\n\x06\x61ge_ms\x18\x08 \x01(\x04\x12\x14\n\x07idle_ms\x18\t \x01(\x04H\x00\x88\x01\x01\x12\x11\n\tis_caller\x18\n \x01(\x08\x12\x15\n\rdriven_scenes\x18\x0b \x03(\tB\n\n\x08_idle_ms\"\\\n\x0bResourceUse\x12\x10\n\x08resource\x18\x01 \x01(\t\x12\x0f\n\x07objects\x18\x02 \x01(\t\x12\r\n\x05scene\x18\x03 \x01(\t\x12\x0c\n\x04held\x18\x04 \x01(\x04\x12\r\n\x05limit\x18\x05 \x01(\x04\"\x1e\n\x10\x45ndClientRequest\x12\n\n\x02id\x18\x01 \x01(\t\"/\n\x11\x45ndClientResponse\x12\x0b\n\x03ids\x18\x01 \x03(\t\x12\r\n\x05\x65nded\x18\x02 \x01(\r\"\xef\x01\n\x15GetServerInfoResponse\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\x0f\n\x07\x62\x61\x63kend\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65vice\x18\x03 \x01(\t\x12\x10\n\x08renderer\x18\x04 \x01(\t\x12\x10\n\x08software\x18\x05 \x01(\x08\x12$\n\x06limits\x18\x06 \x01(\x0b\x32\x14.modalcast.v1.Limits\x12\x18\n\x10protocol_version\x18\x07 \x01(\r\x12\'\n\x08\x66\x65\x61tures\x18\x08 \x03(\x0e\x32\x15.modalcast.v1.Feature\x12\x17\n\x0fviewer_url_path\x18\t \x01(\t\"\xa6\x03\n\x06Limits\x12\x15\n\rmessage_bytes\x18\x01 \x01(\x04\x12\x12\n\nframe_side\x18\x02 \x01(\r\x12\x0e\n\x06scenes\x18\x03 \x01(\r\x12\x0e\n\x06window\x18\x04 \x01(\r\x12\x14\n\x0cupload_bytes\x18\x05 \x01(\x04\x12\x13\n\x0b\x64\x65\x61\x64line_ms\x18\x06 \x01(\r\x12\x0e\n\x06\x64rives\x18\x07 \x01(\r\x12 \n\x18\x63onnection_receive_bytes\x18\x08 \x01(\x04\x12\x1a\n\x12message_timeout_ms\x18\t \x01(\r\x12\x1e\n\x16\x63onnection_reply_bytes\x18\n \x01(\x04\x12\x18\n\x10reply_timeout_ms\x18\x0b \x01(\r\x12\x18\n\x10scene_host_bytes\x18\x0c \x01(\x04\x12\x1a\n\x12scene_device_bytes\x18\r \x01(\x04\x12\x1b\n\x13render_target_bytes\x18\x0e \x01(\x04\x12\x15\n\rclient_scenes\x18\x0f \x01(\r\x12\x1b\n\x13\x63lient_upload_bytes\x18\x10 \x01(\x04\x12\x17\n\x0fstall_budget_ms\x18\x11 \x01(\r*\x8f\x01\n\nClientKind\x12\x1b\n\x17\x43LIENT_KIND_UNSPECIFIED\x10\x00\x12\x16\n\x12\x43LIENT_KIND_SERVER\x10\x01\x12\x17\n\x13\x43LIENT_KIND_SESSION\x10\x02\x12\x17\n\x13\x43LIENT_KIND_PROCESS\x10\x03\x12\x1a\n\x16\x43LIENT_KIND_CONNECTION\x10\x04*\xe4\x01\n\x07\x46\x65\x61ture\x12\x17\n\x13\x46\x45\x41TURE_UNSPECIFIED\x10\x00\x12\x12\n\x0e\x46\x45\x41TURE_FRAMES\x10\x01\x12\x1a\n\x16\x46\x45\x41TURE_CONTENT_HASHES\x10\x02\x12\x18\n\x14\x46\x45\x41TURE_UPLOAD_REUSE\x10\x03\x12\x19\n\x15\x46\x45\x41TURE_UPLOAD_ARRAYS\x10\x04\x12\x19\n\x15\x46\x45\x41TURE_SHARED_MEMORY\x10\x05\x12\x12\n\x0e\x46\x45\x41TURE_VIEWER\x10\x06\x12\x14\n\x10\x46\x45\x41TURE_PACKED_Q\x10\x07\x12\x16\n\x12\x46\x45\x41TURE_RGB_FRAMES\x10\x08\x32\xee\x02\n\rServerService\x12X\n\rGetServerInfo\x12\".modalcast.v1.GetServerInfoRequest\x1a#.modalcast.v1.GetServerInfoResponse\x12\x61\n\x10\x43reateViewerLink\x12%.modalcast.v1.CreateViewerLinkRequest\x1a&.modalcast.v1.CreateViewerLinkResponse\x12R\n\x0bListClients\x12 .modalcast.v1.ListClientsRequest\x1a!.modalcast.v1.ListClientsResponse\x12L\n\tEndClient\x12\x1e.modalcast.v1.EndClientRequest\x1a\x1f.modalcast.v1.EndClientResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'modalcast.v1.server_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_FEATURE']._serialized_start=861
-  _globals['_FEATURE']._serialized_end=1089
+  _globals['_CLIENTKIND']._serialized_start=1465
+  _globals['_CLIENTKIND']._serialized_end=1608
+  _globals['_FEATURE']._serialized_start=1611
+  _globals['_FEATURE']._serialized_end=1839
   _globals['_GETSERVERINFOREQUEST']._serialized_start=43
   _globals['_GETSERVERINFOREQUEST']._serialized_end=65
   _globals['_CREATEVIEWERLINKREQUEST']._serialized_start=67
   _globals['_CREATEVIEWERLINKREQUEST']._serialized_end=111
   _globals['_CREATEVIEWERLINKRESPONSE']._serialized_start=113
   _globals['_CREATEVIEWERLINKRESPONSE']._serialized_end=191
-  _globals['_GETSERVERINFORESPONSE']._serialized_start=194
-  _globals['_GETSERVERINFORESPONSE']._serialized_end=433
-  _globals['_LIMITS']._serialized_start=436
-  _globals['_LIMITS']._serialized_end=858
-  _globals['_SERVERSERVICE']._serialized_start=1092
-  _globals['_SERVERSERVICE']._serialized_end=1296
+  _globals['_LISTCLIENTSREQUEST']._serialized_start=193
+  _globals['_LISTCLIENTSREQUEST']._serialized_end=213
+  _globals['_LISTCLIENTSRESPONSE']._serialized_start=215
+  _globals['_LISTCLIENTSRESPONSE']._serialized_end=342
+  _globals['_CLIENTINFO']._serialized_start=345
+  _globals['_CLIENTINFO']._serialized_end=620
+  _globals['_RESOURCEUSE']._serialized_start=622
+  _globals['_RESOURCEUSE']._serialized_end=714
+  _globals['_ENDCLIENTREQUEST']._serialized_start=716
+  _globals['_ENDCLIENTREQUEST']._serialized_end=746
+  _globals['_ENDCLIENTRESPONSE']._serialized_start=748
+  _globals['_ENDCLIENTRESPONSE']._serialized_end=795
+  _globals['_GETSERVERINFORESPONSE']._serialized_start=798
+  _globals['_GETSERVERINFORESPONSE']._serialized_end=1037
+  _globals['_LIMITS']._serialized_start=1040
+  _globals['_LIMITS']._serialized_end=1462
+  _globals['_SERVERSERVICE']._serialized_start=1842
+  _globals['_SERVERSERVICE']._serialized_end=2208
 # @@protoc_insertion_point(module_scope)

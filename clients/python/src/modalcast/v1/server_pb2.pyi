@@ -7,6 +7,14 @@ from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class ClientKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    CLIENT_KIND_UNSPECIFIED: _ClassVar[ClientKind]
+    CLIENT_KIND_SERVER: _ClassVar[ClientKind]
+    CLIENT_KIND_SESSION: _ClassVar[ClientKind]
+    CLIENT_KIND_PROCESS: _ClassVar[ClientKind]
+    CLIENT_KIND_CONNECTION: _ClassVar[ClientKind]
+
 class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     FEATURE_UNSPECIFIED: _ClassVar[Feature]
@@ -18,6 +26,11 @@ class Feature(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     FEATURE_VIEWER: _ClassVar[Feature]
     FEATURE_PACKED_Q: _ClassVar[Feature]
     FEATURE_RGB_FRAMES: _ClassVar[Feature]
+CLIENT_KIND_UNSPECIFIED: ClientKind
+CLIENT_KIND_SERVER: ClientKind
+CLIENT_KIND_SESSION: ClientKind
+CLIENT_KIND_PROCESS: ClientKind
+CLIENT_KIND_CONNECTION: ClientKind
 FEATURE_UNSPECIFIED: Feature
 FEATURE_FRAMES: Feature
 FEATURE_CONTENT_HASHES: Feature
@@ -47,6 +60,74 @@ class CreateViewerLinkResponse(_message.Message):
     urls: _containers.RepeatedScalarFieldContainer[str]
     public_url: str
     def __init__(self, url_path: _Optional[str] = ..., urls: _Optional[_Iterable[str]] = ..., public_url: _Optional[str] = ...) -> None: ...
+
+class ListClientsRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class ListClientsResponse(_message.Message):
+    __slots__ = ("clients", "omitted", "resources")
+    CLIENTS_FIELD_NUMBER: _ClassVar[int]
+    OMITTED_FIELD_NUMBER: _ClassVar[int]
+    RESOURCES_FIELD_NUMBER: _ClassVar[int]
+    clients: _containers.RepeatedCompositeFieldContainer[ClientInfo]
+    omitted: int
+    resources: _containers.RepeatedCompositeFieldContainer[ResourceUse]
+    def __init__(self, clients: _Optional[_Iterable[_Union[ClientInfo, _Mapping]]] = ..., omitted: _Optional[int] = ..., resources: _Optional[_Iterable[_Union[ResourceUse, _Mapping]]] = ...) -> None: ...
+
+class ClientInfo(_message.Message):
+    __slots__ = ("id", "principal", "kind", "address", "process_id", "process_name", "held", "age_ms", "idle_ms", "is_caller", "driven_scenes")
+    ID_FIELD_NUMBER: _ClassVar[int]
+    PRINCIPAL_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ADDRESS_FIELD_NUMBER: _ClassVar[int]
+    PROCESS_ID_FIELD_NUMBER: _ClassVar[int]
+    PROCESS_NAME_FIELD_NUMBER: _ClassVar[int]
+    HELD_FIELD_NUMBER: _ClassVar[int]
+    AGE_MS_FIELD_NUMBER: _ClassVar[int]
+    IDLE_MS_FIELD_NUMBER: _ClassVar[int]
+    IS_CALLER_FIELD_NUMBER: _ClassVar[int]
+    DRIVEN_SCENES_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    principal: str
+    kind: ClientKind
+    address: str
+    process_id: int
+    process_name: str
+    held: _containers.RepeatedCompositeFieldContainer[ResourceUse]
+    age_ms: int
+    idle_ms: int
+    is_caller: bool
+    driven_scenes: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, id: _Optional[str] = ..., principal: _Optional[str] = ..., kind: _Optional[_Union[ClientKind, str]] = ..., address: _Optional[str] = ..., process_id: _Optional[int] = ..., process_name: _Optional[str] = ..., held: _Optional[_Iterable[_Union[ResourceUse, _Mapping]]] = ..., age_ms: _Optional[int] = ..., idle_ms: _Optional[int] = ..., is_caller: bool = ..., driven_scenes: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class ResourceUse(_message.Message):
+    __slots__ = ("resource", "objects", "scene", "held", "limit")
+    RESOURCE_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    HELD_FIELD_NUMBER: _ClassVar[int]
+    LIMIT_FIELD_NUMBER: _ClassVar[int]
+    resource: str
+    objects: str
+    scene: str
+    held: int
+    limit: int
+    def __init__(self, resource: _Optional[str] = ..., objects: _Optional[str] = ..., scene: _Optional[str] = ..., held: _Optional[int] = ..., limit: _Optional[int] = ...) -> None: ...
+
+class EndClientRequest(_message.Message):
+    __slots__ = ("id",)
+    ID_FIELD_NUMBER: _ClassVar[int]
+    id: str
+    def __init__(self, id: _Optional[str] = ...) -> None: ...
+
+class EndClientResponse(_message.Message):
+    __slots__ = ("ids", "ended")
+    IDS_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
+    ids: _containers.RepeatedScalarFieldContainer[str]
+    ended: int
+    def __init__(self, ids: _Optional[_Iterable[str]] = ..., ended: _Optional[int] = ...) -> None: ...
 
 class GetServerInfoResponse(_message.Message):
     __slots__ = ("version", "backend", "device", "renderer", "software", "limits", "protocol_version", "features", "viewer_url_path")
