@@ -226,7 +226,7 @@ fn rasterize_like_kernels(soup: &Soup, strip_splits: u32) -> (Vec<u64>, [usize; 
 /// The twin panics if a 32-bit edge function overflows.
 #[test]
 fn all_raster_paths_equal_the_reference() {
-    let text = include_str!("../../kernels/raster.cu");
+    let text = concat!(include_str!("../../kernels/raster.cu"), include_str!("../../kernels/raster_setup.cuh"));
     for line in [
         format!("#define MAX_THREAD_SAMPLES {MAX_THREAD_SAMPLES}"),
         format!("#define MAX_WARP_EXTENT {MAX_WARP_EXTENT}"),
