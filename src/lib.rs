@@ -37,14 +37,15 @@
 //! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |
 //! | `modalcast::telemetry` | stage names and times, logging | |
 //! | `modalcast::config` | all limits and paths, validated once | |
-//! | `modalcast-compute::gpu` | the CUDA deformer, rasterizer and PNG encoder, in the three tiers below | `storage` |
+//! | `modalcast-compute::gpu` | the CUDA deformer, rasterizer, view renderer and PNG encoder, in the three tiers below | `storage` |
 //! | `modalcast-compute::gpu::executor` | one launcher per kernel, with the kernel's name; steps in flight, outputs, readbacks, OpenGL interop, PNG files | `tables`, `launch` |
 //! | `modalcast-compute::gpu::tables` | device arrays and launch plan of a scene, inputs of a step, strips of a PNG; pure functions | `launch` |
 //! | `modalcast-compute::gpu::launch` | access to a CUDA device: context, memory, compilation, launches, graphs | |
 //! | `modalcast-compute::cpu` | the f32 deformer for machines without a GPU | `storage` |
-//! | `modalcast-compute::reference` | the f64 reference deformer, which the others are tested against | |
+//! | `modalcast-compute::reference` | the f64 reference deformer, rasterizer and view renderer, which the others are tested against | |
 //! | `modalcast-compute::storage` | tiled storage of U for CPU and GPU: storage types, a-priori bounds; pure functions | |
 //! | `modalcast-render::renderer` | the calls that load scenes and draw them; frames in flight, choice of rasterizers | `passes`, `resources`, `shaders`, `layout`, `uniforms`, `scene_data`, `device`, `pieces`, `region`, `types`, `pass` |
+//! | `modalcast-render::view_data` | static data and cameras of batches of small views; pure functions | `resources`, `scene_data`, `uniforms`, `types` |
 //! | `modalcast-render::passes` | the commands of each pass (culling, shadow, visibility, transparency, shading, post-processing, picking, AOV), its inputs, outputs and barriers | `resources`, `shaders`, `layout`, `scene_data`, `uniforms`, `device`, `pieces`, `region`, `types`, `pass` |
 //! | `modalcast-render::resources` | buffers, textures and programs of a scene, images of a frame | `shaders`, `plan`, `layout`, `scene_data`, `device`, `pieces`, `region`, `types` |
 //! | `modalcast-render::shaders` | shader sources, specialized to the features of a scene | `plan`, `layout`, `scene_data`, `device`, `types` |
@@ -62,6 +63,7 @@
 //! | `modalcast-model::beam_shape` | meshes that follow the sections of beams, and the inertia of beams | `domain`, `error` |
 //! | `modalcast-model::deform` | the trait of deformers | `scene`, `shared_memory`, `error` |
 //! | `modalcast-model::raster` | the trait of compute rasterizers, which replace OpenGL in selected passes | `scene`, `shared_memory`, `error` |
+//! | `modalcast-model::views` | batches of small views: scene, cameras and outputs as plain data | `raster`, `scene`, `error` |
 //! | `modalcast-model::shared_memory` | the traits of device memory that OpenGL and CUDA share, and of its copies to the host | `error` |
 //! | `modalcast-model::backend_settings` | settings of deformers and rasterizers, which are not part of a scene | `scene` |
 //! | `modalcast-model::scene` | the set of domains, its memory layout and feature set; steps; cameras | `domain`, `rounding`, `escaping`, `error` |

@@ -18,3 +18,4 @@ pub mod rounding;
 pub mod scene;
 pub mod shared_memory;
 pub mod tree;
+pub mod views;

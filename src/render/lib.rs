@@ -59,6 +59,7 @@ mod scene_data;
 mod shaders;
 mod types;
 mod uniforms;
+pub mod view_data;
 
 pub use self::device::readback_ring::MAX_FRAMES_IN_FLIGHT;
 pub use self::device::{EglDevice, devices};

@@ -5,7 +5,7 @@ pub(crate) mod cull;
 pub(crate) mod depth_pyramid;
 pub(crate) mod oit;
 pub(crate) mod programs;
-mod raster_mesh;
+pub(crate) mod raster_mesh;
 pub(crate) mod scene_buffers;
 pub(crate) mod shadow_cache;
 pub(crate) mod shadow_map;

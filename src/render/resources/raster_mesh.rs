@@ -24,7 +24,7 @@ pub(super) fn raster_geometry(scene: &Scene, positions: GlBuffer, anisotropy: f3
 
 /// Alpha data of cut-out triangles and of the blended triangles, which follow in the draw order. Blended triangles cast
 /// shadows where their alpha reaches a threshold.
-fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOuts> {
+pub(crate) fn cut_outs(scene: &Scene, geometry: &Geometry, anisotropy: f32) -> Option<CutOuts> {
     let first_triangle = geometry.groups.iter().find(|group| group.blend_mode != BlendMode::Opaque)?.first_triangle;
     let uv_of = |corner: u32| geometry.uvs.get(corner as usize).copied().unwrap_or_default();
     let arrays = arrays(scene, TextureRole::Color);

@@ -8,6 +8,7 @@ use super::light_box::{LightBox, LightBoxParams};
 use crate::types::FrameParams;
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::{BoundingBox, OrientedBounds, RenderSettings, Scene};
+use modalcast_model::views::ViewCamera;
 
 /// Uniform block of a frame; matrices are column-major. Twin of `FrameBlock` in `shaders/shared/frame.glsl`.
 #[repr(C)]
@@ -102,6 +103,20 @@ impl FrameUniforms {
         match numbers.iter().all(|number| number.is_finite()) {
             true => Ok(frame),
             false => Err(invalid("camera", "a camera whose matrices are finite", format!("{:?}", params.camera))),
+        }
+    }
+
+    /// The camera of a small view with the same picture.
+    pub(crate) fn view_camera(&self) -> ViewCamera {
+        let xyz = |[x, y, z, _]: [f32; 4]| [x, y, z];
+        ViewCamera {
+            clip_from_world: std::array::from_fn(|entry| self.clip_from_world[entry % 4][entry / 4]),
+            world_from_ndc: std::array::from_fn(|entry| self.world_from_ndc[entry % 3][entry / 3]),
+            eye: xyz(self.eye),
+            ground_center: xyz(self.ground_center),
+            ground_half_side: self.ground_center[3],
+            ground_fade: self.ground[3],
+            sees_ground: u32::from(self.eye[3] > 0.0),
         }
     }
 
