@@ -1,4 +1,5 @@
-// Classification of a triangle by the number of samples that it may cover, and its clipped polygon. Twin:
+// Classification of a triangle by the number of samples that it may cover, and its clipped polygon. Shared by the
+// rasterizers: raster.cu, which draws a window, and views.cu, which draws tiles of many small views. Twin:
 // src/compute/reference/raster.rs.
 //   MAX_THREAD_SAMPLES, MAX_WARP_EXTENT  macros, as raster.cu describes them
 #pragma once

@@ -3,6 +3,8 @@
 
 #![allow(clippy::expect_used, clippy::panic, missing_docs, reason = "a test may fail")]
 
+pub mod views;
+
 use std::sync::Arc;
 
 pub use crate::gpu::{CAPABILITIES, CompiledVariant, assert_compiles};

@@ -258,11 +258,12 @@ fn has_twin_in_launcher_tests(name: &str) -> bool {
 }
 
 /// Kernels whose CPU twin is a method of a model or reference type, instead of a file with the name of the kernel.
-const METHOD_TWINS: [(&str, Twin); 4] = [
+const METHOD_TWINS: [(&str, Twin); 5] = [
     ("apply", Twin { file: "src/model/scene/state.rs", type_name: "SceneState", method: "apply" }),
     ("bounds", Twin { file: "src/model/scene/camera.rs", type_name: "BoundingBox", method: "union" }),
     ("png", Twin { file: "src/frame/png/mod.rs", type_name: "PngLayout", method: "encode_strip" }),
     ("raster", Twin { file: "src/compute/reference/raster.rs", type_name: "VisibilityBuffer", method: "draw" }),
+    ("views", Twin { file: "src/compute/reference/views.rs", type_name: "ReferenceViewRenderer", method: "draw" }),
 ];
 
 /// A method that computes the same result as a kernel on the CPU.

@@ -27,6 +27,7 @@ mod tables;
 
 pub use executor::png::{DevicePicture, EncodedPng, PendingPng, PngEncoder};
 pub use executor::raster::{CudaRasterizer, RasterGranularity, RasterVariant};
+pub use executor::views::{CudaViewRenderer, DeviceVertices, DeviceViews};
 pub use executor::{CudaDeformer, CudaPictureMemory, MAX_STEPS_IN_FLIGHT, PreparedDeformer, device_layout_values};
 #[cfg(any(test, feature = "testing"))]
 pub use launch::{CAPABILITIES, CompiledVariant, assert_compiles};

@@ -4,6 +4,7 @@ mod deform;
 mod normals;
 pub mod raster;
 mod rigid_normals;
+pub mod views;
 
 use std::sync::Arc;
 use std::time::Instant;

@@ -23,6 +23,7 @@ use super::output_ring::{OutputRing, StepTarget};
 use super::pinned_surface::{PinnedSurface, SurfaceLengths};
 use super::readback::{ReadbackPool, ReadbackRequest, SynchronousLists};
 use super::step_slot::{StepKernels, StepKind, StepSlot};
+use super::views::DeviceVertices;
 use crate::gpu::launch::cleanup::WaitForStream;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, KernelKind};
@@ -288,6 +289,19 @@ impl CudaDeformer {
                 return Ok(summary);
             }
         }
+    }
+
+    /// The vertices of the shown step on the device. Work on the device's stream that reads them is ordered after the
+    /// step, and before later steps.
+    ///
+    /// # Errors
+    /// `Fault` when there was no step.
+    pub fn device_vertices(&self) -> Result<DeviceVertices<'_>> {
+        let no_step = || Error::Fault { stage: "vertices", reason: "expected a deformed step, got none".into() };
+        let ranges = self.output.ranges(self.output_ring.shown_output().ok_or_else(no_step)?);
+        // SAFETY: the ranges are those of an output set, which exists as long as the deformer. A deformer waits for the
+        // stream before it releases them.
+        Ok(unsafe { DeviceVertices::from_ranges(ranges, self.device.stream()) })
     }
 
     /// Starts the graph of the last full step again, to measure its time.

@@ -10,6 +10,7 @@
 //! | `readback`, `pinned_surface` | asynchronous readback of vertices, concurrent with the next step |
 //! | `picture` | pictures that OpenGL draws and CUDA copies to the host |
 //! | `raster` | compute rasterizer, which draws into OpenGL's buffers or shared memory |
+//! | `views` | batches of small views |
 //! | `texture` | images as textures |
 //! | `shared_range` | ranges of memory that CUDA shares with OpenGL |
 //! | `png` | PNG encoder, from pixels in device memory to a file in pinned memory |
@@ -31,6 +32,7 @@ mod readback;
 mod shared_range;
 mod step_slot;
 mod texture;
+pub(crate) mod views;
 
 pub use deformer::{CudaDeformer, MAX_STEPS_IN_FLIGHT, PreparedDeformer};
 pub use layout_check::device_layout_values;

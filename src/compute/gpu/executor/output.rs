@@ -18,6 +18,7 @@ use cudarc::driver::{result, sys};
 use super::interop::{GlInterop, MapAccess, Mapping, RegisteredBuffer, with_mapped};
 use super::pinned_surface::SurfaceLists;
 use super::shared_range::CudaRange;
+use super::views::DeviceRange;
 use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, DeviceBuffer, ExportedMemory, download};
 use crate::gpu::tables::plan::{BufferRole, DeformPlan};
@@ -328,6 +329,13 @@ impl OutputBuffers {
             unsafe { download(device, address, list) }?;
         }
         Ok(())
+    }
+
+    /// The ranges of positions, normals and tangents of an existing set.
+    pub(super) fn ranges(&self, set: usize) -> [DeviceRange; 3] {
+        let OutputSet { addresses: OutputAddresses { positions, normals, tangents }, sizes, .. } = &self.sets[set];
+        let addresses = [*positions, *normals, *tangents];
+        std::array::from_fn(|index| DeviceRange { address: addresses[index], bytes: sizes[index] })
     }
 
     /// The addresses of an existing set. They are valid while the set exists.

@@ -16,7 +16,7 @@
 
 mod check;
 mod cuda_rasterizer;
-mod cut_out;
+pub(super) mod cut_out;
 mod variant;
 
 use std::ops::Range;

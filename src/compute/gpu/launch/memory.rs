@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use bytemuck::Pod;
 use cudarc::driver::{
-    CudaContext, CudaSlice, DevicePtr as _, DeviceRepr, PinnedHostSlice, ValidAsZeroBits, result, sys,
+    CudaContext, CudaSlice, CudaStream, DevicePtr as _, DeviceRepr, PinnedHostSlice, ValidAsZeroBits, result, sys,
 };
 
 use super::context::CurrentContext;
@@ -72,6 +72,11 @@ impl DeviceBuffer {
     /// The device address of the first byte, for arguments of kernels. It is valid while the buffer exists.
     pub fn address(&self) -> u64 {
         self.slice.device_ptr(self.slice.stream()).0
+    }
+
+    /// The stream that orders the release of the memory.
+    pub(crate) fn stream(&self) -> &Arc<CudaStream> {
+        self.slice.stream()
     }
 
     /// Size in bytes.

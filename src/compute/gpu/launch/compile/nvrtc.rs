@@ -13,7 +13,7 @@ const REMEDY: &str = "Install the PyPI wheel nvidia-cuda-nvrtc==13.0.* (pip inst
                       'nvidia-cuda-nvrtc==13.0.*'), or set MODALCAST_NVRTC to the path of libnvrtc.so.13";
 
 /// Headers that kernels may include, by name.
-const HEADERS: [(&str, &str); 15] = [
+const HEADERS: [(&str, &str); 16] = [
     ("layout.cuh", include_str!("../../../../../kernels/layout.cuh")),
     ("batch_load.cuh", include_str!("../../../../../kernels/batch_load.cuh")),
     ("dependent_launch.cuh", include_str!("../../../../../kernels/dependent_launch.cuh")),
@@ -26,6 +26,7 @@ const HEADERS: [(&str, &str); 15] = [
     ("png_huffman.cuh", include_str!("../../../../../kernels/png_huffman.cuh")),
     ("raster.cuh", include_str!("../../../../../kernels/raster.cuh")),
     ("raster_setup.cuh", include_str!("../../../../../kernels/raster_setup.cuh")),
+    ("view_shading.cuh", include_str!("../../../../../kernels/view_shading.cuh")),
     ("warp_tile.cuh", include_str!("../../../../../kernels/warp_tile.cuh")),
     ("rigid_normals.cuh", include_str!("../../../../../kernels/rigid_normals.cuh")),
     ("direction.cuh", include_str!("../../../../../kernels/direction.cuh")),
