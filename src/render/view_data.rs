@@ -12,8 +12,8 @@ use crate::scene_data::textures::{TextureRole, cutoff, mip_levels};
 use crate::types::FrameParams;
 use crate::uniforms::frame::FrameUniforms;
 
-/// Largest anisotropy of textures, as common devices have it.
-const ANISOTROPY: f32 = 16.0;
+/// Maximum anisotropy of texture lookups, as that of frames on hardware (`device/gl/limits.rs`).
+const ANISOTROPY: f32 = 8.0;
 
 /// The static data of the views of a scene. Shadows, ambient occlusion and anti-aliasing of the look are off.
 ///
