@@ -29,6 +29,7 @@ Examples:
   modalcast report render --out report --load tree --load triangles-3000000 --size 1920x1080
   modalcast report render --out report --load square --variant 'variance 512*'
   modalcast report render --out report --raster --load triangles-3000000 --size 1920x1080
+  modalcast report render --out report --views
   modalcast report render --out figures --figures
   modalcast report render --out figures --figures --scene path/to/plant --size 1280x960";
 
@@ -73,6 +74,10 @@ pub(super) struct Args {
     /// on the loads and scenes. Writes pipeline.json. Needs an NVIDIA GPU.
     #[arg(long, conflicts_with_all = ["variants", "figures", "raster"])]
     pipeline: bool,
+    /// Only measure batches of small views, and compare their pictures with single frames. Writes views.json and
+    /// views.md. Needs an NVIDIA GPU.
+    #[arg(long, conflicts_with_all = ["loads", "variants", "figures", "raster", "pipeline", "scenes", "size"])]
+    views: bool,
     /// A scene of your own, a path to a model or a scene folder; repeatable. With --figures, also draws a picture of
     /// it. Without --figures and --pipeline, only its frame times are measured: times.json and a picture.
     #[arg(long = "scene", value_name = "PATH", conflicts_with_all = ["variants", "quick"])]
@@ -92,6 +97,9 @@ pub(super) fn run(args: &Args) -> Outcome {
     }
     if args.pipeline {
         return run_pipelines(args);
+    }
+    if args.views {
+        return run_views(args);
     }
     if !args.scenes.is_empty() {
         if !args.loads.is_empty() {
@@ -138,6 +146,18 @@ fn run_pipelines(args: &Args) -> Outcome {
     report.rows.iter().for_each(|row| print_line(row.line()));
     report.undrawn_steps.iter().for_each(|step| print_line(step.line()));
     report.readback.iter().for_each(|rates| print_line(rates.line()));
+    print_line(format!("written to {}", args.out.display()));
+    Ok(Completion::Success)
+}
+
+fn run_views(args: &Args) -> Outcome {
+    let (world_count, default_replays) = if args.quick { (256, 20) } else { (4096, 100) };
+    let replays = args.replays.map_or(default_replays, |replays| replays as usize);
+    let report = with_spinner("measuring", || {
+        render::measure_views(world_count, replays, |what| tracing::info!(what, "measuring"))
+    })?;
+    report.write(&args.out)?;
+    report.rows.iter().for_each(|row| print_line(row.line()));
     print_line(format!("written to {}", args.out.display()));
     Ok(Completion::Success)
 }

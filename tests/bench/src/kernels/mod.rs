@@ -40,5 +40,5 @@ pub use kernel_benchmark::{ArrayTraffic, KernelAttributes, KernelBenchmark};
 pub use overlap::{HostWrite, Overlap, measure_overlap, time_host_writes};
 pub use raster::{RasterBenchmark, RasterCounts, RasterMesh};
 pub use thesis::{KernelSplit, LaneCounts, ThesisBenchmark, count_lanes, idle_lanes_per_warp};
-pub use timer::{gigabytes_per_second, time_empty_kernel, time_steps};
+pub use timer::{gigabytes_per_second, time_empty_kernel, time_steps, time_stream};
 pub use upload::time_upload;

@@ -78,6 +78,26 @@ pub fn time_steps(
     Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))
 }
 
+/// Times work that `work` submits to the device's stream by events, after some untimed runs.
+///
+/// # Errors
+/// Errors of `work` and of the device.
+pub fn time_stream(device: &Device, replays: usize, mut work: impl FnMut() -> Result<()>) -> Result<Timing> {
+    let warm_up_start = Instant::now();
+    while warm_up_start.elapsed() < WARM_UP {
+        work()?;
+        device.stream().synchronize().map_err(fault_in("replay"))?;
+    }
+    let mut times = Vec::with_capacity(replays);
+    for _ in 0..replays {
+        let event_pair = EventPair::new(device)?;
+        event_pair.record_around(device, &mut work)?;
+        device.stream().synchronize().map_err(fault_in("replay"))?;
+        times.push(event_pair.microseconds()?);
+    }
+    Timing::of(times).ok_or_else(|| invalid("replays", "at least 1", 0))
+}
+
 /// Times a graph with one empty kernel: the lower limit of any step's time.
 ///
 /// # Errors

@@ -25,6 +25,7 @@
 //! - [`plants`]: the plants of table 4.5 of the thesis, deformed and drawn.
 //! - [`frame_times`]: frame times of user-supplied scenes, for comparison with other programs.
 //! - [`figures`]: reproduces figures of the thesis.
+//! - `view_workloads`, `views_report`: batches of small views on a CUDA device, and their difference from single frames.
 //! - `output`, `markdown`, `comparison_tables`, `raster_report`, `plot`, `image_files`: the files of a report.
 
 mod ambient_occlusion;
@@ -64,6 +65,8 @@ mod tests;
 mod texture_panels;
 mod time_budget;
 pub mod variants;
+mod view_workloads;
+mod views_report;
 pub mod workloads;
 
 use serde::Serialize;
@@ -81,6 +84,7 @@ pub use self::raster_comparison::RasterComparison;
 pub use self::raster_report::{RasterReport, compare_rasterizers};
 pub use self::readback::ReadbackRates;
 use self::variants::RenderVariant;
+pub use self::views_report::{ViewsReport, ViewsRow, measure_views};
 use self::workloads::RenderWorkload;
 use super::is_selected;
 use super::provenance::Provenance;

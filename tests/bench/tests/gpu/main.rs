@@ -19,3 +19,4 @@ mod report;
 mod scenes;
 #[path = "../../../common/soups.rs"]
 mod soups;
+mod views;
