@@ -1061,8 +1061,9 @@ pub mod scene_service_client {
     use tonic::codegen::http::Uri;
     /// Opens, uploads, lists, closes and describes scenes.
     ///
-    /// A new scene and its files count to a client of the principal (Limits.client_scenes, Limits.client_upload_bytes): to the
-    /// session of the viewer, to the process at the other end of a Unix socket, or else to the connection.
+    /// A new scene counts to a client of the principal (Limits.client_scenes): to the session of the viewer, to the process at
+    /// the other end of a Unix socket, or else to the connection. Its files count to the principal
+    /// (Limits.client_upload_bytes).
     ///
     /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
     /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
@@ -1539,8 +1540,9 @@ pub mod scene_service_server {
     }
     /// Opens, uploads, lists, closes and describes scenes.
     ///
-    /// A new scene and its files count to a client of the principal (Limits.client_scenes, Limits.client_upload_bytes): to the
-    /// session of the viewer, to the process at the other end of a Unix socket, or else to the connection.
+    /// A new scene counts to a client of the principal (Limits.client_scenes): to the session of the viewer, to the process at
+    /// the other end of a Unix socket, or else to the connection. Its files count to the principal
+    /// (Limits.client_upload_bytes).
     ///
     /// A new scene belongs to the principal that opens it. For other principals it does not exist, unless it is shared with
     /// them; the role `admin` controls every scene. A principal with whom a scene is shared may call all methods that its role
@@ -5975,7 +5977,7 @@ pub struct Limits {
     /// too many small frames; a blocked stream of the smallest steps uses up to a fifth of this budget.
     #[prost(uint32, tag = "7")]
     pub drives: u32,
-    /// Limit in bytes on the messages that one connection is sending. A message counts with its whole length from its
+    /// Limit in bytes on the messages that one client is sending. A message counts with its whole length from its
     /// first byte until it is complete; a request, until it is answered. A message above the limit is rejected with
     /// REASON_LIMIT_REACHED.
     #[prost(uint64, tag = "8")]
@@ -6008,8 +6010,8 @@ pub struct Limits {
     /// built-in scene does not count. SceneService tells what a client is.
     #[prost(uint32, tag = "15")]
     pub client_scenes: u32,
-    /// Limit in bytes on the uploads of one client: their declared size while they are in progress, and then the size of
-    /// their files until their scenes are deleted. A client may have four uploads in progress.
+    /// Limit in bytes on the uploads of one principal: their declared size while they are in progress, and then the size of
+    /// their files until their scenes are deleted.
     #[prost(uint64, tag = "16")]
     pub client_upload_bytes: u64,
     /// The stall budget of a writer that asks for none, in milliseconds (OpenDrive.stall_budget_ms).

@@ -17,10 +17,8 @@ pub struct Account {
 /// What distinguishes the clients of a principal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Client {
-    /// The server itself, and programs that run the engine in their process.
+    /// The server itself, which keeps what outlives clients, and programs that run the engine in their process.
     Server,
-    /// All clients of the principal, for what outlives them.
-    Any,
     /// A session of the viewer, by its token.
     Session(TokenHash),
     /// A process that is connected to a Unix socket, by its id.
@@ -54,7 +52,6 @@ impl fmt::Display for Account {
         write!(out, "{}/", self.principal_name())?;
         match self.client {
             Client::Server => out.write_str("server"),
-            Client::Any => out.write_str("any"),
             Client::Session(token) => write!(out, "session-{}", token.short_name()),
             Client::Process(id) => write!(out, "process-{id}"),
             Client::Connection(number) => write!(out, "connection-{number}"),

@@ -26,9 +26,9 @@ pub(super) struct UploadPermit {
     _bytes: Permit,
 }
 
-/// An upload outlives its client, so that its bytes count to the principal.
+/// An upload outlives its client, so that its bytes count to the principal alone.
 fn account_of_principal(principal: Option<Arc<str>>) -> Account {
-    Account { principal, client: Client::Any }
+    Account { principal, client: Client::Server }
 }
 
 impl UploadPermits {
