@@ -340,7 +340,8 @@ mod tests {
     fn scenes_with_invalid_lengths_or_indices_are_rejected() {
         scene().check().expect("a valid scene");
         assert_eq!([0, 1].map(|triangle| scene().cull_mode(triangle)), [CullMode::Back, CullMode::None]);
-        let changes: [(&str, fn(&mut ViewScene)); 10] = [
+        type Change = (&'static str, fn(&mut ViewScene));
+        let changes: [Change; 10] = [
             ("triangle_corners", |scene| scene.triangle_corners.truncate(1)),
             ("triangle_materials", |scene| scene.triangle_materials.push(0)),
             ("triangle_domains", |scene| scene.triangle_domains[1] = 1),

@@ -323,6 +323,7 @@ mod tests {
             figures: false,
             pipeline: false,
             raster: false,
+            views: false,
             scenes: vec![],
         }
     }

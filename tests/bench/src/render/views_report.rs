@@ -234,14 +234,7 @@ fn measure(
     let mut compared_views = renderer.prepare(&compared_batch)?;
     renderer.draw(&deformer.device_vertices()?, &mut compared_views)?;
     let pictures = compared_views.read(device)?;
-    let mut single_pictures = ViewPictures::default();
-    for view in &compared {
-        let mut single_view = renderer.prepare(&ViewBatch { views: std::slice::from_ref(view), ..compared_batch })?;
-        renderer.draw(&deformer.device_vertices()?, &mut single_view)?;
-        let ViewPictures { color, domains, .. } = single_view.read(device)?;
-        single_pictures.color.extend(color);
-        single_pictures.domains.extend(domains);
-    }
+    let single_pictures = draw_one_by_one(device, &deformer, &renderer, &compared_batch)?;
     let surface = deformer.surface()?;
     let frames = match harness.filter(|_| workload.outputs.color) {
         Some(harness) => Some(compare_with_frames(device, harness, workload, surface, &compared, &pictures)?),
@@ -266,6 +259,24 @@ fn measure(
         reference,
         reference_views_per_s,
     })
+}
+
+/// The pictures of a batch whose views are drawn in batches of their own.
+fn draw_one_by_one(
+    device: &Arc<Device>,
+    deformer: &CudaDeformer,
+    renderer: &CudaViewRenderer,
+    batch: &ViewBatch<'_>,
+) -> Result<ViewPictures> {
+    let mut pictures = ViewPictures::default();
+    for view in batch.views {
+        let mut single_view = renderer.prepare(&ViewBatch { views: std::slice::from_ref(view), ..*batch })?;
+        renderer.draw(&deformer.device_vertices()?, &mut single_view)?;
+        let ViewPictures { color, domains, .. } = single_view.read(device)?;
+        pictures.color.extend(color);
+        pictures.domains.extend(domains);
+    }
+    Ok(pictures)
 }
 
 fn frame_params(workload: &ViewWorkload, camera: Camera) -> FrameParams {
