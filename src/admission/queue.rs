@@ -249,7 +249,7 @@ mod tests {
         assert_eq!(queue.free(), 100);
     }
 
-    /// Clients of a principal with much wait for one of another principal, however many they are.
+    /// Clients of a principal that holds much wait for one of another principal, however many clients they are.
     #[test]
     fn principals_share_before_clients() {
         let queue = queue();
@@ -270,7 +270,7 @@ mod tests {
         assert_eq!(queue.free(), 100);
     }
 
-    /// Control for the order: without the share, the client that was first would have everything.
+    /// One client cannot take everything, and its further requests do not delay those of others.
     #[test]
     fn client_leaves_units_for_others_and_is_passed_over() {
         let queue = queue();

@@ -2,10 +2,10 @@
 //! protocol. Shared memory is off unless the configuration names a Unix socket.
 //!
 //! A connection to that socket owns slots for replies and slots for steps, whose memory is bounded: at most
-//! [`crate::admission::Limit::SHARED_MEMORY`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the budget of replies.
-//! The copied values of a step count as those of a step in several messages. A call without a free slot for a reply
-//! waits until its client returns one or the connection ends. The first call that uses a connection binds it to the
-//! principal of the call.
+//! [`crate::admission::Limit::SHARED_MEMORY`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the
+//! budget of replies. The copied values of a step count as those of a step in several messages. A call without a free
+//! slot for a reply waits until its client returns one or the connection ends. The first call that uses a connection
+//! binds it to the principal of the call.
 
 mod reply_memory;
 mod request_memory;

@@ -125,8 +125,8 @@ impl StepAssembler {
         self.memory.resize(0).ok();
     }
 
-    /// Waits until the parts of an incomplete step are lost to another client or the next part is overdue. Pends forever without an
-    /// incomplete step. Cancel-safe.
+    /// Waits until the parts of an incomplete step are lost to another client, or the next part is overdue. Pends forever
+    /// without an incomplete step. Cancel-safe.
     pub(super) async fn stalled(&self) -> Error {
         let State::Assembling(partial) = &self.state else { return std::future::pending().await };
         tokio::select! {
