@@ -29,6 +29,7 @@ mod state_pool;
 mod step_update;
 mod transform_format;
 mod transform_roots;
+mod worlds;
 
 pub use ambient_occlusion::AmbientOcclusion;
 pub use camera::{BoundingBox, Camera, Lens, View};
