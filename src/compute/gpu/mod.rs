@@ -27,8 +27,12 @@ mod tables;
 
 pub use executor::png::{DevicePicture, EncodedPng, PendingPng, PngEncoder};
 pub use executor::raster::{CudaRasterizer, RasterGranularity, RasterVariant};
+pub use executor::view_ring::{ViewArrayLayout, ViewRing};
 pub use executor::views::{CudaViewRenderer, DeviceVertices, DeviceViews};
-pub use executor::{CudaDeformer, CudaPictureMemory, MAX_STEPS_IN_FLIGHT, PreparedDeformer, device_layout_values};
+pub use executor::{
+    CudaDeformer, CudaPictureMemory, MAX_STEPS_IN_FLIGHT, PinnedArray, PinnedPool, PreparedDeformer,
+    device_layout_values,
+};
 #[cfg(any(test, feature = "testing"))]
 pub use launch::{CAPABILITIES, CompiledVariant, assert_compiles};
 pub use launch::{Device, DeviceInfo, KernelDescriptor, KernelKind, Probe, probe};

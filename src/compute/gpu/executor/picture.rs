@@ -6,16 +6,16 @@
 
 use std::ops::Range;
 use std::rc::Rc;
-use std::slice;
 use std::sync::Arc;
 
 use cudarc::driver::{CudaEvent, CudaStream, sys};
 
 use super::picture_encoder::{Encoding, PictureEncoder};
+use super::pinned_pixels::PinnedPixels;
 use super::png::DevicePicture;
 use crate::gpu::launch::cleanup::WaitForStream;
 use crate::gpu::launch::error::cuda_error;
-use crate::gpu::launch::{Device, ExportedMemory, PinnedBuffer, PinnedUse};
+use crate::gpu::launch::{Device, ExportedMemory};
 use modalcast_model::error::{Result, fault};
 use modalcast_model::shared_memory::{
     CopiedPixels, CopiedPng, CopyRequest, HostPixels, NewPicture, PictureMemory, PngRequest, SharedPicture,
@@ -56,20 +56,6 @@ struct RequestedPng {
     encoding: Rc<Encoding>,
     copies_pixels: bool,
 }
-
-/// Pinned host memory. Only a copy that [`CudaPicture`] has started writes it, and readers get it after the copy.
-#[derive(Debug)]
-struct PinnedPixels {
-    /// Address of the first byte of `buffer`, because the buffer calls the driver for each access.
-    address: *const u8,
-    bytes: usize,
-    _buffer: PinnedBuffer<u8>,
-}
-
-// SAFETY: the memory belongs to this value. It is written only by a copy that starts while no reader has a reference.
-unsafe impl Send for PinnedPixels {}
-// SAFETY: as above.
-unsafe impl Sync for PinnedPixels {}
 
 impl CudaPictureMemory {
     /// Creates the streams of the copies and of the encodings.
@@ -143,7 +129,7 @@ impl CudaPicture {
     fn copy(&self, range: Range<usize>) -> Result<()> {
         let guard = WaitForStream::new(&self.copy_stream);
         if !range.is_empty() {
-            let target = self.pixels.address.cast_mut().wrapping_add(range.start).cast();
+            let target = self.pixels.address.wrapping_add(range.start).cast();
             let source = self.memory.address() + range.start as u64;
             // SAFETY: both memories have the range and belong to this value, which waits for the copy before it is dropped.
             // No reader has a reference to the pixels, and gets one only after the copy. If this fails before the event is
@@ -173,17 +159,9 @@ impl CudaPicture {
     }
 }
 
-impl PinnedPixels {
-    fn new(device: &Device, bytes: usize) -> Result<Self> {
-        let buffer = PinnedBuffer::<u8>::zeroed(device, bytes, PinnedUse::FromDevice)?;
-        Ok(Self { address: buffer.address()? as *const u8, bytes, _buffer: buffer })
-    }
-}
-
 impl HostPixels for PinnedPixels {
     fn bytes(&self) -> &[u8] {
-        // SAFETY: `_buffer` has these bytes, which are initialized. No copy writes them while a reader has a reference.
-        unsafe { slice::from_raw_parts(self.address, self.bytes) }
+        self.as_slice()
     }
 }
 

@@ -48,6 +48,10 @@ pub(super) struct MipmappedTexture {
     stream: Arc<CudaStream>,
 }
 
+// SAFETY: the driver accepts the handles of an array and of a texture on every thread on which their context is current,
+// and `drop` makes it current. A texture has no other state, and no method changes it.
+unsafe impl Send for MipmappedTexture {}
+
 impl MipmappedTexture {
     /// Creates the texture and waits for the copy of its texels.
     ///

@@ -12,14 +12,16 @@ use std::sync::Arc;
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaFunction, CudaStream, LaunchConfig};
 
+use super::pinned_pixels::{PinnedArray, PinnedPool};
 use super::raster::check_cut_outs;
 use super::raster::cut_out::CutOutBuffers;
 use super::texture::{MipmappedTexture, TextureImage};
+use super::view_ring::{RingViews, ViewRing};
 use crate::gpu::launch::{Device, DeviceBuffer, LaunchOrder, launch_kernel};
-use modalcast_model::error::{Result, fault, invalid};
+use modalcast_model::error::{Error, Result, fault, invalid};
 use modalcast_model::scene::{CullMode, MAX_VIEWPORT_SIDE};
 use modalcast_model::views::{
-    View, ViewBatch, ViewCamera, ViewFormat, ViewLight, ViewMaterial, ViewPictures, ViewScene,
+    View, ViewBatch, ViewCamera, ViewFormat, ViewLight, ViewMaterial, ViewOutputs, ViewPictures, ViewScene,
 };
 
 const SOURCE: &str = include_str!("../../../../kernels/views.cu");
@@ -106,6 +108,8 @@ struct TriangleChunk {
 }
 
 /// Draws batches of views of one scene.
+///
+/// Dropping it waits for the work on the device's stream, because its static data belong to another stream.
 #[derive(Debug)]
 pub struct CudaViewRenderer {
     device: Arc<Device>,
@@ -197,16 +201,34 @@ pub struct DeviceViews {
     chunk_count: usize,
     /// Boxes of the chunks of each world, if chunks are culled.
     boxes: Option<DeviceBuffer>,
-    color: Option<DeviceBuffer>,
-    depth: Option<DeviceBuffer>,
-    domains: Option<DeviceBuffer>,
-    normals: Option<DeviceBuffer>,
+    arrays: ViewArrays,
+}
+
+/// The memory of a batch's pictures.
+#[derive(Debug)]
+enum ViewArrays {
+    /// Color, depth, domains and normals, as far as they are drawn.
+    Own(Box<[Option<DeviceBuffer>; 4]>),
+    Ring(RingViews),
+}
+
+impl ViewArrays {
+    /// Addresses of color, depth, domains and normals; 0 for an array that is not drawn.
+    fn addresses(&self) -> [u64; 4] {
+        match self {
+            Self::Own(arrays) => arrays.each_ref().map(|array| array.as_ref().map_or(0, DeviceBuffer::address)),
+            Self::Ring(views) => views.addresses(),
+        }
+    }
 }
 
 impl DeviceViews {
-    /// The colors: see [`modalcast_model::views::ViewOutputs`]. `None` if they were not requested.
-    pub const fn color(&self) -> Option<&DeviceBuffer> {
-        self.color.as_ref()
+    /// The colors: see [`modalcast_model::views::ViewOutputs`]. `None` if they were not requested, or are in a ring.
+    pub fn color(&self) -> Option<&DeviceBuffer> {
+        match &self.arrays {
+            ViewArrays::Own(arrays) => arrays[0].as_ref(),
+            ViewArrays::Ring(_) => None,
+        }
     }
 
     /// Changes the cameras before the next call of [`CudaViewRenderer::draw`].
@@ -225,7 +247,7 @@ impl DeviceViews {
     /// Waits for the pictures of the last draw and copies them to the host.
     ///
     /// # Errors
-    /// `Fault` when the device fails.
+    /// `Fault` when they are in a ring, or when the device fails.
     pub fn read(&self, device: &Device) -> Result<ViewPictures> {
         fn list<T: Pod>(device: &Device, buffer: Option<&DeviceBuffer>) -> Result<Vec<T>> {
             let Some(buffer) = buffer else { return Ok(Vec::new()) };
@@ -233,17 +255,41 @@ impl DeviceViews {
             buffer.read(device, 0, &mut list)?;
             Ok(list)
         }
+        let ViewArrays::Own(arrays) = &self.arrays else { return Err(in_ring_error()) };
+        let [color, depth, domains, normals] = &**arrays;
         Ok(ViewPictures {
-            color: list(device, self.color.as_ref())?,
-            depth: list(device, self.depth.as_ref())?,
-            domains: list(device, self.domains.as_ref())?,
-            normals: list(device, self.normals.as_ref())?,
+            color: list(device, color.as_ref())?,
+            depth: list(device, depth.as_ref())?,
+            domains: list(device, domains.as_ref())?,
+            normals: list(device, normals.as_ref())?,
         })
     }
 }
 
+impl DeviceViews {
+    /// Waits for the pictures of the last draw and copies them to pinned memory: color, depth, domains and normals, as
+    /// far as they are drawn.
+    ///
+    /// # Errors
+    /// `Fault` when they are in a ring, when the driver cannot lock enough memory, or when the device fails.
+    pub fn read_pinned(&self, device: &Device, pool: &mut PinnedPool) -> Result<[Option<PinnedArray>; 4]> {
+        let ViewArrays::Own(arrays) = &self.arrays else { return Err(in_ring_error()) };
+        let mut copies = [const { None }; 4];
+        for (copy, array) in copies.iter_mut().zip(&**arrays) {
+            let Some(array) = array else { continue };
+            *copy = Some(pool.fill(device, array.bytes() as usize, |target| array.read(device, 0, target))?);
+        }
+        Ok(copies)
+    }
+}
+
+fn in_ring_error() -> Error {
+    fault("views", "expected pictures that are not in a ring")
+}
+
 impl CudaViewRenderer {
-    /// Compiles the kernels and uploads the static data of a scene.
+    /// Compiles the kernels and uploads the static data of a scene. Any thread may call this. The work has a stream of
+    /// its own, and is complete when this returns.
     ///
     /// # Errors
     /// `Invalid` if the scene is inconsistent; `Unavailable` when NVRTC is missing; `Fault` when the device fails.
@@ -252,18 +298,26 @@ impl CudaViewRenderer {
         if let Some(cut_outs) = &scene.cut_outs {
             check_cut_outs(scene.triangle_vertices.len(), cut_outs)?;
         }
-        let mut functions = device.functions(&FUNCTIONS, SOURCE, &defines(scene))?;
+        let upload_device = device.with_own_stream()?;
+        let _current = upload_device.enter()?;
+        let mut functions = upload_device.functions(&FUNCTIONS, SOURCE, &defines(scene))?;
         let (Some(bound_chunks), Some(views)) = (functions.pop(), functions.pop()) else {
             return Err(fault("load kernel", "expected two functions"));
         };
         let upload_image = |image: &modalcast_model::views::ViewImage| {
             let size = [image.width, image.height];
             let texture_image = TextureImage { size, levels: &image.levels, channels: 4, is_srgb: image.is_srgb };
-            MipmappedTexture::new(device, texture_image, scene.anisotropy)
+            MipmappedTexture::new(&upload_device, texture_image, scene.anisotropy)
         };
         let images = scene.images.iter().map(upload_image).collect::<Result<Vec<_>>>()?;
-        let tables = SceneTables::new(device, scene, &images)?;
+        let tables = SceneTables::new(&upload_device, scene, &images)?;
+        upload_device.synchronize("upload")?;
         Ok(Self { device: Arc::clone(device), views, bound_chunks, tables, _images: images })
+    }
+
+    /// The device that draws.
+    pub const fn device(&self) -> &Arc<Device> {
+        &self.device
     }
 
     /// Uploads a batch and allocates its outputs.
@@ -271,12 +325,36 @@ impl CudaViewRenderer {
     /// # Errors
     /// `Invalid` if the batch is; `Fault` when the device has not enough memory.
     pub fn prepare(&self, batch: &ViewBatch<'_>) -> Result<DeviceViews> {
-        let (device, world_count) = (&*self.device, batch.check()?);
         let pixels = (batch.views.len() * batch.format.pixel_count()) as u64;
-        let output = |is_requested: bool, pixel_bytes: u64| {
-            is_requested.then(|| DeviceBuffer::zeroed(device, pixel_bytes * pixels)).transpose()
+        let array = |is_requested: bool, pixel_bytes: u64| {
+            is_requested.then(|| DeviceBuffer::zeroed(&self.device, pixel_bytes * pixels)).transpose()
         };
-        let outputs = batch.format.outputs;
+        let ViewOutputs { color, depth, domains, normals } = batch.format.outputs;
+        let arrays = [array(color, 3)?, array(depth, 4)?, array(domains, 4)?, array(normals, 12)?];
+        self.prepare_arrays(batch, ViewArrays::Own(Box::new(arrays)))
+    }
+
+    /// Uploads a batch whose pictures are drawn into a slot of a ring, from the place of `first_view` on.
+    ///
+    /// # Errors
+    /// `Invalid` if the batch is, or for a slot or views that the ring does not have; `Fault` if the ring belongs to
+    /// another device or has other arrays, or when the device has not enough memory.
+    pub fn prepare_in_ring(
+        &self,
+        batch: &ViewBatch<'_>,
+        ring: &Arc<ViewRing>,
+        slot: usize,
+        first_view: usize,
+    ) -> Result<DeviceViews> {
+        let views = ring.views(slot, first_view, batch.views.len())?;
+        if !Arc::ptr_eq(views.device(), &self.device) || !views.has_format(&batch.format) {
+            return Err(fault("views", "expected a ring of this device with the arrays of the batch"));
+        }
+        self.prepare_arrays(batch, ViewArrays::Ring(views))
+    }
+
+    fn prepare_arrays(&self, batch: &ViewBatch<'_>, arrays: ViewArrays) -> Result<DeviceViews> {
+        let (device, world_count) = (&*self.device, batch.check()?);
         let chunk_count = self.tables.chunk_count;
         let culls_chunks = chunk_count >= MIN_CULLED_CHUNKS && batch.views.len() >= 2 * world_count;
         let box_bytes = 6 * size_of::<f32>() * world_count * chunk_count;
@@ -288,10 +366,7 @@ impl CudaViewRenderer {
             format: batch.format,
             chunk_count,
             boxes: culls_chunks.then(|| DeviceBuffer::zeroed(device, box_bytes as u64)).transpose()?,
-            color: output(outputs.color, 3)?,
-            depth: output(outputs.depth, 4)?,
-            domains: output(outputs.domains, 4)?,
-            normals: output(outputs.normals, 12)?,
+            arrays,
         })
     }
 
@@ -326,9 +401,10 @@ impl CudaViewRenderer {
         }
         let shared_bytes = size_of::<u64>() as u32 * args.tile_height * args.width;
         // SAFETY: `ViewScene::check` and `check_cut_outs` verified all indices of the tables. `ViewBatch::check`
-        // verified those of the views, and the loop above the sizes of the vertices. `prepare` allocated outputs and
-        // boxes for these views and this number of chunks. All memory exists until the kernels have ended: that of
-        // `self` and `views` is released in the order of the stream, and `DeviceVertices` promises the same.
+        // verified those of the views, and the loop above the sizes of the vertices. `prepare_arrays` got outputs for
+        // these views, aligned to 4 bytes, and allocated boxes for this number of chunks. All memory exists until the
+        // kernels have ended: that of `views` is released in the order of the stream, a ring and `self` wait for the
+        // stream before they are released, and `DeviceVertices` promises one of both.
         unsafe { self.start(&self.views, views.view_count * args.tiles_per_view, shared_bytes, &args) }
     }
 
@@ -348,6 +424,7 @@ impl CudaViewRenderer {
         let address = |buffer: &Option<DeviceBuffer>| buffer.as_ref().map_or(0, DeviceBuffer::address);
         let cut_outs = tables.cut_outs.as_ref().map(CutOutBuffers::addresses).unwrap_or_default();
         let [tile_height, tiles_per_view] = tile_layout(format);
+        let [color, depth, domains, out_normals] = views.arrays.addresses();
         let chunks_per_turn = tables.chunk_count as u32 / (TURNS_PER_WARP * WARPS_PER_BLOCK);
         ViewsArgs {
             views: views.views.address(),
@@ -366,10 +443,10 @@ impl CudaViewRenderer {
             cut_out_uvs: cut_outs.uvs,
             cut_out_materials: cut_outs.material_indices,
             alpha_materials: cut_outs.materials,
-            color: address(&views.color),
-            depth: address(&views.depth),
-            domains: address(&views.domains),
-            out_normals: address(&views.normals),
+            color,
+            depth,
+            domains,
+            out_normals,
             vertex_count: tables.vertex_count as u32,
             corner_count: tables.corner_count as u32,
             chunk_count: tables.chunk_count as u32,
@@ -385,6 +462,13 @@ impl CudaViewRenderer {
             depth_includes_ground: u32::from(format.depth_includes_ground),
             light: tables.light,
         }
+    }
+}
+
+impl Drop for CudaViewRenderer {
+    fn drop(&mut self) {
+        // After a fault the call fails, but then no kernel runs.
+        self.device.stream().synchronize().ok();
     }
 }
 

@@ -75,6 +75,15 @@ impl Device {
         self.ordinal
     }
 
+    /// The UUID of the device, by which another process finds it.
+    ///
+    /// # Errors
+    /// `Fault` when the driver reports one.
+    pub fn uuid(&self) -> Result<[u8; 16]> {
+        let uuid = self.context.uuid().map_err(cuda_error("device"))?;
+        Ok(uuid.bytes.map(|byte| byte as u8))
+    }
+
     /// Compute capability, major and minor.
     pub const fn capability(&self) -> (i32, i32) {
         self.capability
