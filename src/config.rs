@@ -202,10 +202,11 @@ pub struct ViewerRecording {
 pub struct Config {
     /// The addresses to listen on, at least one. The default is loopback.
     pub listen: Vec<ListenAddress>,
-    /// The path of a Unix socket for clients of the same user on this machine, which can send steps and receive
-    /// vertices and frames in shared memory. `None` turns shared memory off.
+    /// The path of a further Unix socket for clients of the same user on this machine, which can send steps and receive
+    /// vertices, frames and views in shared memory. The others are in the folder `local_sockets`.
     pub shared_memory: Option<PathBuf>,
-    /// The folder of a Unix socket `PORT.sock` for each TCP port that the server listens on. `None`: no sockets.
+    /// The folder of two Unix sockets for each TCP port that the server listens on: `PORT.sock` for calls, and
+    /// `PORT.memory.sock` for shared memory. `None`: no sockets.
     pub local_sockets: Option<PathBuf>,
     /// Who may connect to the Unix sockets in `listen`.
     pub socket_permissions: SocketPermissions,

@@ -31,7 +31,7 @@
 //! |---|---|---|
 //! | `modalcast::cli` | the command line: one file per command | `config`, `service`, `engine`, `admission`, `identity`, `frame`, `telemetry` |
 //! | `modalcast::service` | gRPC services, and the viewer's page and WebSocket on the same port, over TLS if it is on; health and metrics on a port of their own: convert between wire messages and engine types; the only module that uses the protobuf types | `config`, `engine`, `admission`, `identity`, `telemetry` |
-//! | `modalcast::engine` | the device thread, open scenes and who may use them, step queues, subscriptions, forces, persistent state | `config`, `frame`, `admission`, `identity`, `telemetry` |
+//! | `modalcast::engine` | the device thread, open scenes and who may use them, step queues, subscriptions, worlds of small views, forces, persistent state | `config`, `frame`, `admission`, `identity`, `telemetry` |
 //! | `modalcast::admission` | permits for everything that is limited in number, shared between principals and clients | `config`, `identity` |
 //! | `modalcast::identity` | principals, their credentials and their roles | |
 //! | `modalcast::frame` | PNG and JPEG encoding, color maps with legends; pure functions | |

@@ -51,9 +51,10 @@ pub struct StageTime {
 /// Data in shared memory, in place of the field `data` of a chunk, or of `q` or `transforms` of a step. Only for a
 /// client on the server's machine, on request.
 ///
-/// The server offers shared memory if it has FEATURE_SHARED_MEMORY. Its operator sets the path of a Unix socket for this
-/// purpose (`modalcast serve --shared-memory PATH`), to which only processes of the server's user can connect. All
-/// numbers on that socket are little-endian.
+/// The server offers shared memory if it has FEATURE_SHARED_MEMORY, at Unix sockets to which only processes of its user
+/// can connect: PORT.memory.sock for each TCP port of a server that authenticates its clients, in the folder of the
+/// sockets for programs of this user, and the path that its operator sets (`modalcast serve --shared-memory PATH`). All
+/// numbers on these sockets are little-endian.
 ///
 /// 1. The client connects to the socket. The server sends 32 bytes: u32 version of this handshake, 1; u32 size of a
 ///    slot in bytes; u32 number of slots; u32 zero; 16 bytes of a random token. With them it sends the file
@@ -73,6 +74,10 @@ pub struct StageTime {
 ///    `shared_q` or `shared_transforms`. The server copies the values when it receives the message, and then returns
 ///    the slot: it sends the number of the slot as u32 on the socket. It validates the copy. Values in shared memory
 ///    count for Limits.message_bytes as those of a message do.
+/// 1. Device memory (DrawViews with `device_slots`): before it confirms the call, the server sends the u32 2^32 - 1 and the
+///    u32 number of slots on the socket, and with them a file descriptor of each slot's memory. The client returns slot n
+///    as the u32 2^31 + n, when its own work on the slot has ended. The slots end with the call; the client can still
+///    read memory that it has imported. A connection serves one such call.
 ///    If no slot is free for a reply, the server waits until one is returned. A client must therefore return the slots of a
 ///    message before it waits for the next message, and a connection serves one call at a time. After a call has ended with
 ///    OK and all of its slots were returned, the client can use the connection for another call. Otherwise, for example
@@ -5814,6 +5819,491 @@ pub mod force_service_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct DrawViewsRequest {
+    #[prost(oneof = "draw_views_request::Kind", tags = "1, 2")]
+    pub kind: ::core::option::Option<draw_views_request::Kind>,
+}
+/// Nested message and enum types in `DrawViewsRequest`.
+pub mod draw_views_request {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Kind {
+        #[prost(message, tag = "1")]
+        Open(super::OpenViews),
+        #[prost(message, tag = "2")]
+        Step(super::ViewStep),
+    }
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct OpenViews {
+    #[prost(string, tag = "1")]
+    pub scene: ::prost::alloc::string::String,
+    /// Number of worlds, 1 to 65536; 0 means 1.
+    #[prost(uint32, tag = "2")]
+    pub worlds: u32,
+    /// Size of a view in pixels, 1 to 1024 on each side; 0 x 0 means 64 x 64.
+    #[prost(uint32, tag = "3")]
+    pub width: u32,
+    #[prost(uint32, tag = "4")]
+    pub height: u32,
+    /// What each view shows, each once: OUTPUT_COLOR, OUTPUT_DEPTH or OUTPUT_DEPTH_WITH_GROUND, OUTPUT_DOMAINS and
+    /// OUTPUT_NORMALS. Empty: OUTPUT_COLOR.
+    #[prost(enumeration = "Output", repeated, tag = "5")]
+    pub outputs: ::prost::alloc::vec::Vec<i32>,
+    /// 1 to 65536 cameras; empty: one camera that frames the rest bounds of a world. An unset field of a camera is that of
+    /// this camera.
+    #[prost(message, repeated, tag = "6")]
+    pub cameras: ::prost::alloc::vec::Vec<Camera>,
+    /// Empty: every camera sees every world; with C cameras, view w C + c shows world w as camera c sees it. Else one world
+    /// per camera: view c shows world camera_worlds\[c\] as camera c sees it. A step has at most 65536 views.
+    #[prost(uint32, repeated, tag = "7")]
+    pub camera_worlds: ::prost::alloc::vec::Vec<u32>,
+    /// Number of slots of device memory, 1 to 16, in which the pictures of a step stay on the GPU, see DeviceSlots; 0: the
+    /// pictures are sent. Only for a call with shared memory, see SharedRange.
+    #[prost(uint32, tag = "8")]
+    pub device_slots: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ViewStep {
+    /// New values of the worlds, which keep all other values. As in DriveScene, but for the domains of all worlds: domain d
+    /// of world w has the index w D + d in a scene of D domains, and `q` without `q_domains` has all coordinates of the
+    /// first world, then those of the second, and so on. All positions must be within reach of one origin for f32.
+    #[prost(message, optional, tag = "1")]
+    pub step: ::core::option::Option<Step>,
+    /// New cameras, as many as in OpenViews; empty: unchanged.
+    #[prost(message, repeated, tag = "2")]
+    pub cameras: ::prost::alloc::vec::Vec<Camera>,
+    /// Draw only the views of the first worlds; 0 means all. Must be 0 with camera_worlds. If the step has several parts
+    /// (Step.has_more), this and `cameras` are those of the last part.
+    #[prost(uint32, tag = "3")]
+    pub drawn_worlds: u32,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct DrawViewsResponse {
+    #[prost(oneof = "draw_views_response::Part", tags = "1, 2, 3, 4")]
+    pub part: ::core::option::Option<draw_views_response::Part>,
+}
+/// Nested message and enum types in `DrawViewsResponse`.
+pub mod draw_views_response {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Part {
+        #[prost(message, tag = "1")]
+        Opened(super::ViewsOpened),
+        #[prost(message, tag = "2")]
+        Chunk(super::ViewChunk),
+        /// A step that was not applied. The worlds keep the values of the step before it.
+        #[prost(message, tag = "3")]
+        Rejection(super::Rejection),
+        /// All pictures of a step, with device_slots; in place of chunks.
+        #[prost(message, tag = "4")]
+        Device(super::DeviceViews),
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ViewsOpened {
+    #[prost(uint32, tag = "1")]
+    pub worlds: u32,
+    #[prost(uint32, tag = "2")]
+    pub width: u32,
+    #[prost(uint32, tag = "3")]
+    pub height: u32,
+    #[prost(enumeration = "Output", repeated, tag = "4")]
+    pub outputs: ::prost::alloc::vec::Vec<i32>,
+    /// Number of views of a step in which all worlds are drawn.
+    #[prost(uint32, tag = "5")]
+    pub views: u32,
+    /// Number of coordinates and of transforms of one world: those of `q` and `transforms` in a step of all domains.
+    #[prost(uint32, tag = "6")]
+    pub coordinates: u32,
+    #[prost(uint32, tag = "7")]
+    pub transforms: u32,
+    /// Only with OpenViews.device_slots.
+    #[prost(message, optional, tag = "8")]
+    pub device_slots: ::core::option::Option<DeviceSlots>,
+}
+/// Memory of the GPU that the client imports, so that it reads the pictures without a copy. A slot has the arrays of one
+/// step. Its allocation is one of cuMemCreate, whose POSIX file descriptor arrives on the socket of the shared memory.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct DeviceSlots {
+    /// UUID of the device, 16 bytes.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub device: ::prost::bytes::Bytes,
+    /// Bytes of the allocation of each slot.
+    #[prost(uint64, repeated, tag = "2")]
+    pub bytes: ::prost::alloc::vec::Vec<u64>,
+    /// Offset of the array of each output in a slot, in the order of ViewsOpened.outputs.
+    #[prost(uint64, repeated, tag = "3")]
+    pub offsets: ::prost::alloc::vec::Vec<u64>,
+}
+/// The pictures of a step in a slot of device memory. They are complete: work that the client starts now may read them.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct DeviceViews {
+    /// Number of the step.
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    /// The slot, which belongs to the client until it returns it.
+    #[prost(uint32, tag = "2")]
+    pub slot: u32,
+    #[prost(message, repeated, tag = "3")]
+    pub stages: ::prost::alloc::vec::Vec<StageTime>,
+}
+/// A part of one array of a step. Each output is an array of the pictures of all views, one after another, top row first,
+/// little-endian, without padding:
+///
+/// * OUTPUT_COLOR: height x width x 3 bytes sRGB
+/// * OUTPUT_DEPTH, OUTPUT_DEPTH_WITH_GROUND: height x width f32, meters along the view axis; infinity where nothing is
+/// * OUTPUT_DOMAINS: height x width i32: the index of the domain within its world; -1 where none is
+/// * OUTPUT_NORMALS: height x width x 3 f32: unit normal in world axes that faces the camera; zeros where nothing is
+///   A step is complete when all bytes of all its arrays have arrived.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ViewChunk {
+    /// Number of the step.
+    #[prost(uint64, tag = "1")]
+    pub step: u64,
+    #[prost(enumeration = "Output", tag = "2")]
+    pub output: i32,
+    /// Offset of `data` in the array, in bytes. The chunks of an array are in the order of their offsets.
+    #[prost(uint64, tag = "3")]
+    pub offset: u64,
+    /// Times of the part of the views to which this chunk belongs; on the first chunk of each part.
+    #[prost(message, repeated, tag = "4")]
+    pub stages: ::prost::alloc::vec::Vec<StageTime>,
+    /// At most 1 MiB.
+    #[prost(bytes = "bytes", tag = "5")]
+    pub data: ::prost::bytes::Bytes,
+    /// The data, if they are in shared memory. `data` is then empty.
+    #[prost(message, optional, tag = "6")]
+    pub shared: ::core::option::Option<SharedRange>,
+}
+/// Generated client implementations.
+pub mod view_service_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// Batches of small pictures, for programs that learn from pictures or collect data sets.
+    #[derive(Debug, Clone)]
+    pub struct ViewServiceClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl ViewServiceClient<tonic::transport::Channel> {
+        /// Attempt to create a new client by connecting to a given endpoint.
+        pub async fn connect<D>(dst: D) -> Result<Self, tonic::transport::Error>
+        where
+            D: TryInto<tonic::transport::Endpoint>,
+            D::Error: Into<StdError>,
+        {
+            let conn = tonic::transport::Endpoint::new(dst)?.connect().await?;
+            Ok(Self::new(conn))
+        }
+    }
+    impl<T> ViewServiceClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> ViewServiceClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            ViewServiceClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// Draws many small pictures (views) of many copies of a scene (worlds). The worlds belong to this call: its steps move
+        /// them, nobody else sees them, and they leave the scene and its writer as they are. A world never appears in the view of
+        /// another one.
+        ///
+        /// The first request opens the worlds, and the first reply confirms that. Each further request is a step, after which
+        /// all views are drawn again. The replies to a step are the pictures in chunks, or one rejection; they precede those of
+        /// the next step. A client may send steps ahead. Until it reads the replies, the server stops to read requests. The call
+        /// ends when the client has closed its side and all replies are sent.
+        ///
+        /// A view has one sample per pixel, and no shadows, ambient occlusion or antialiasing; otherwise it is the picture that
+        /// FrameService draws of the same state. Materials with alpha_mode "blend", bloom and lines along edges are refused.
+        pub async fn draw_views(
+            &mut self,
+            request: impl tonic::IntoStreamingRequest<Message = super::DrawViewsRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::DrawViewsResponse>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/modalcast.v1.ViewService/DrawViews",
+            );
+            let mut req = request.into_streaming_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("modalcast.v1.ViewService", "DrawViews"));
+            self.inner.streaming(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod view_service_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with ViewServiceServer.
+    #[async_trait]
+    pub trait ViewService: std::marker::Send + std::marker::Sync + 'static {
+        /// Server streaming response type for the DrawViews method.
+        type DrawViewsStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::DrawViewsResponse, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Draws many small pictures (views) of many copies of a scene (worlds). The worlds belong to this call: its steps move
+        /// them, nobody else sees them, and they leave the scene and its writer as they are. A world never appears in the view of
+        /// another one.
+        ///
+        /// The first request opens the worlds, and the first reply confirms that. Each further request is a step, after which
+        /// all views are drawn again. The replies to a step are the pictures in chunks, or one rejection; they precede those of
+        /// the next step. A client may send steps ahead. Until it reads the replies, the server stops to read requests. The call
+        /// ends when the client has closed its side and all replies are sent.
+        ///
+        /// A view has one sample per pixel, and no shadows, ambient occlusion or antialiasing; otherwise it is the picture that
+        /// FrameService draws of the same state. Materials with alpha_mode "blend", bloom and lines along edges are refused.
+        async fn draw_views(
+            &self,
+            request: tonic::Request<tonic::Streaming<super::DrawViewsRequest>>,
+        ) -> std::result::Result<tonic::Response<Self::DrawViewsStream>, tonic::Status>;
+    }
+    /// Batches of small pictures, for programs that learn from pictures or collect data sets.
+    #[derive(Debug)]
+    pub struct ViewServiceServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> ViewServiceServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for ViewServiceServer<T>
+    where
+        T: ViewService,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/modalcast.v1.ViewService/DrawViews" => {
+                    #[allow(non_camel_case_types)]
+                    struct DrawViewsSvc<T: ViewService>(pub Arc<T>);
+                    impl<
+                        T: ViewService,
+                    > tonic::server::StreamingService<super::DrawViewsRequest>
+                    for DrawViewsSvc<T> {
+                        type Response = super::DrawViewsResponse;
+                        type ResponseStream = T::DrawViewsStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<
+                                tonic::Streaming<super::DrawViewsRequest>,
+                            >,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as ViewService>::draw_views(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = DrawViewsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for ViewServiceServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "modalcast.v1.ViewService";
+    impl<T> tonic::server::NamedService for ViewServiceServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct GetServerInfoRequest {}
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -6073,8 +6563,8 @@ pub enum Feature {
     UploadReuse = 3,
     /// UploadArrays accepts scenes without files.
     UploadArrays = 4,
-    /// VertexService and FrameService send data in shared memory to clients on the same machine, and StepService receives
-    /// steps in it, see SharedRange.
+    /// VertexService, FrameService and ViewService send data in shared memory to clients on the same machine, and
+    /// StepService and ViewService receive steps in it, see SharedRange.
     SharedMemory = 5,
     /// The port also serves browsers: the viewer and a WebSocket that carries these calls (proto/websocket.md).
     Viewer = 6,

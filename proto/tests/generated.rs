@@ -10,8 +10,9 @@ use std::path::Path;
 #[test]
 fn generated_code_matches_the_proto_files() {
     let proto_folder = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let proto_files = ["common", "errors", "scenes", "steps", "frames", "vertices", "states", "forces", "server"]
-        .map(|name| format!("modalcast/v1/{name}.proto"));
+    let proto_files =
+        ["common", "errors", "scenes", "steps", "frames", "vertices", "states", "forces", "views", "server"]
+            .map(|name| format!("modalcast/v1/{name}.proto"));
     // protox is a compiler in Rust, so that no protoc is needed.
     let descriptors = protox::compile(proto_files, [proto_folder]).expect("expected valid .proto files");
     let folder = tempfile::tempdir().expect("expected a temporary folder");

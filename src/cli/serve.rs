@@ -32,8 +32,8 @@ pub(super) struct Args {
     /// can connect to. The option can be repeated. Each address is printed as 'listening on URL'.
     #[arg(long, env = "MODALCAST_LISTEN", value_delimiter = ',', default_values_t = Config::default().listen)]
     listen: Vec<ListenAddress>,
-    /// Path of a Unix socket at which programs of this user ask for shared memory, in which they send steps and receive
-    /// vertices and frames. Default: off.
+    /// Path of a further Unix socket at which programs of this user ask for shared memory, in which they send steps and
+    /// receive vertices, frames and views. A server with credentials always has such a socket for each TCP port.
     #[arg(long, env = "MODALCAST_SHARED_MEMORY", value_name = "PATH")]
     shared_memory: Option<PathBuf>,
     /// TOML file that names further users of the server, with their roles and credentials. It is read again when it changes.

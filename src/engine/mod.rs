@@ -15,7 +15,8 @@
 //! | encoder threads | the pixels become a file, once for all readers of a format | `output::frame_encoder` |
 //! | call of the reader | waits for the pictures, lets them be encoded, and sends them | `output::frame_queue` |
 //!
-//! Vertices and picks take the same path without the encoder threads.
+//! Vertices and picks take the same path without the encoder threads. Batches of small views have a path of their own
+//! ([`views`]): copies of a scene that one caller moves, without a task.
 
 mod blocking;
 mod catch_unwind;
@@ -37,6 +38,7 @@ mod storage;
 #[cfg(test)]
 mod testing;
 mod upload_permits;
+mod views;
 
 pub(crate) use blocking::run_blocking;
 pub use content::{ContentHash, ContentHashes, SceneContent, ShapeArray, hex, parse_hash};
@@ -44,6 +46,7 @@ pub use device::context::{DeviceContext, EngineInfo, share_pictures};
 pub use device::device_loss::DeviceLoss;
 pub use device::handle::PendingReply;
 pub use device::loaded_scene::LoadedScene;
+pub use device::loaded_worlds::{DrawnViews, ExportedSlots};
 pub use device::scalar_field::validate_mode;
 pub use memory_limits::MemoryLimits;
 pub use output::frame_encoder::FrameEncoder;
@@ -76,6 +79,7 @@ pub use storage::array_upload::{ArrayUpload, ArrayUploadHeader, UploadedDomain, 
 pub use storage::provenance::{SceneProvenance, validate_scene_name};
 pub use storage::scene_record::{EVERYONE, SceneAccess, SceneRight};
 pub use storage::upload::{Upload, UploadHeader};
+pub use views::{Pairing, PendingViews, ViewSession, ViewSettings, ViewStep, ViewUpdate};
 
 #[cfg(test)]
 pub(crate) use testing::lossless_lease;

@@ -19,6 +19,9 @@ const RESERVE_DIVISOR: u64 = 8;
 /// Output sets of a deformer: one is written while another is copied.
 const OUTPUT_SETS: u64 = 2;
 
+/// Pieces of a batch of views that exist at a time: one is drawn, two are sent.
+const PIECES_IN_MEMORY: u64 = 3;
+
 /// The budgets that all scenes share.
 #[derive(Debug)]
 pub(super) struct MemoryBudgets {
@@ -94,6 +97,31 @@ impl MemoryBudgets {
 }
 
 impl SceneMemory {
+    /// Reserves the memory of worlds of a scene, whose pictures have at most `picture_bytes` at a time.
+    ///
+    /// # Errors
+    /// `OutOfMemory`.
+    pub(super) fn reserve_worlds(&self, name: &str, scene: &Scene, count: usize, picture_bytes: usize) -> Result<()> {
+        let object = format!("{count} worlds of scene '{name}'");
+        let pictures = PIECES_IN_MEMORY * picture_bytes as u64;
+        let shared = array_bytes(scene) + 4 * pixel_bytes(scene) / 3;
+        let worlds = shared.saturating_add(world_bytes(scene, count));
+        if self.has_device {
+            self.host.resize(&object, worlds.saturating_add(pictures))?;
+            self.device.resize(&object, worlds.saturating_add(pictures))
+        } else {
+            self.host.resize(&object, worlds.saturating_mul(2).saturating_add(pictures))
+        }
+    }
+
+    /// Reserves device memory for pictures, in addition to the rest.
+    ///
+    /// # Errors
+    /// `OutOfMemory`.
+    pub(super) fn reserve_pictures(&self, object: &str, bytes: u64) -> Result<()> {
+        self.device.reserve(object, bytes)
+    }
+
     /// Replaces what the loaders have reserved by the memory of the loaded scene on host and device.
     ///
     /// # Errors
@@ -113,6 +141,12 @@ impl SceneMemory {
             self.host.resize(&object, host.saturating_add(device))
         }
     }
+}
+
+/// Bytes that `count` worlds of a scene take on the host and on the device, apart from the arrays that they share: as
+/// [`output_bytes`] and [`domain_bytes`] of all worlds.
+fn world_bytes(scene: &Scene, count: usize) -> u64 {
+    (count as u64).saturating_mul(output_bytes(scene) + domain_bytes(scene))
 }
 
 /// Host memory of a scene: its arrays and pixels, and copies of the outputs of a deformer.

@@ -25,10 +25,12 @@ mod camera;
 mod frame_info;
 mod output;
 mod vertices;
+mod views;
 
 pub(super) use frame_info::wire_frame_info;
-pub(super) use output::{FrameUse, wire_format};
+pub(super) use output::{FrameUse, wire_format, wire_frame_output};
 pub(super) use vertices::{parse_vertex_selection, wire_sections};
+pub(super) use views::{parse_view_settings, parse_view_update, wire_device_slots, wire_views_opened};
 
 /// Limit in bytes on the remarks in one scene description.
 const MAX_REMARK_BYTES: usize = 64 << 10;

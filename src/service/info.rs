@@ -12,7 +12,6 @@ use super::connection::MAX_DRIVES;
 use super::status::to_status;
 use super::stream::respond_once;
 use crate::admission::Limit;
-use crate::config::Config;
 use crate::engine::{Engine, EngineInfo};
 use crate::identity::{Credential, Principal, Role};
 use modalcast_model::error::{Error, invalid};
@@ -23,6 +22,7 @@ pub(super) struct ServerServiceImpl {
     pub(super) clients: ClientTable,
     /// See `CreateViewerLinkResponse.urls`.
     pub(super) viewer_urls: Vec<String>,
+    pub(super) has_shared_memory: bool,
 }
 
 #[tonic::async_trait]
@@ -64,7 +64,7 @@ impl v1::server_service_server::ServerService for ServerServiceImpl {
             software: is_software,
             limits: Some(limits),
             protocol_version: v1::PROTOCOL_VERSION,
-            features: list_features(info, config).into_iter().map(Into::into).collect(),
+            features: list_features(info, self.has_shared_memory, config.viewer).into_iter().map(Into::into).collect(),
             viewer_url_path: if config.viewer { "/".into() } else { String::new() },
         }))
     }
@@ -128,14 +128,14 @@ fn to_ms(duration: Duration) -> u32 {
 }
 
 /// The features of a server with these devices and settings.
-fn list_features(info: &EngineInfo, config: &Config) -> Vec<v1::Feature> {
+fn list_features(info: &EngineInfo, has_shared_memory: bool, has_viewer: bool) -> Vec<v1::Feature> {
     let mut features =
         vec![v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays, v1::Feature::PackedQ];
     if info.renderer.is_ok() {
         features.extend([v1::Feature::Frames, v1::Feature::RgbFrames]);
     }
-    features.extend(config.shared_memory.is_some().then_some(v1::Feature::SharedMemory));
-    features.extend(config.viewer.then_some(v1::Feature::Viewer));
+    features.extend(has_shared_memory.then_some(v1::Feature::SharedMemory));
+    features.extend(has_viewer.then_some(v1::Feature::Viewer));
     features
 }
 
@@ -162,10 +162,9 @@ mod tests {
         let info = |renderer| EngineInfo { backend: Backend::Cpu, device: "none".into(), renderer, memory };
         let always =
             [v1::Feature::ContentHashes, v1::Feature::UploadReuse, v1::Feature::UploadArrays, v1::Feature::PackedQ];
-        let config = |shared_memory, viewer| Config { shared_memory, viewer, ..Config::default() };
         let no_renderer = info(Err(fault("renderer", "none")));
-        assert_eq!(list_features(&no_renderer, &config(None, false)), always);
-        let features = list_features(&info(Ok(renderer)), &config(Some("socket".into()), true));
+        assert_eq!(list_features(&no_renderer, false, false), always);
+        let features = list_features(&info(Ok(renderer)), true, true);
         let expected = [v1::Feature::Frames, v1::Feature::RgbFrames, v1::Feature::SharedMemory, v1::Feature::Viewer];
         assert_eq!(features[always.len()..], expected);
     }

@@ -23,8 +23,8 @@ use modalcast_model::error::{Error, Result};
 #[derive(Debug)]
 pub struct Listener {
     pub(super) sockets: ListeningSockets,
-    /// The socket for shared memory, if it is on.
-    pub(super) shared_memory: Option<UnixListener>,
+    /// The sockets for shared memory.
+    pub(super) shared_memory: Vec<UnixListener>,
     /// The files of the Unix sockets.
     pub(super) files: Vec<SocketFile>,
     urls: Vec<String>,
@@ -68,7 +68,7 @@ impl Listener {
     pub(super) async fn bind(config: &Config) -> Result<Self> {
         let mut listener = Self {
             sockets: ListeningSockets::default(),
-            shared_memory: None,
+            shared_memory: Vec::new(),
             files: Vec::new(),
             urls: Vec::new(),
             addresses: Vec::new(),
@@ -109,8 +109,8 @@ impl Listener {
         Ok(listener)
     }
 
-    /// Adds a socket for each TCP port, which programs of this user find by the port. The server runs without those that
-    /// cannot be created.
+    /// Adds two sockets for each TCP port, which programs of this user find by the port: one for calls, and one for shared
+    /// memory. The server runs without those that cannot be created.
     fn add_local_sockets(&mut self, folder: &Path) {
         let ports: BTreeSet<u16> = self.addresses.iter().map(SocketAddr::port).collect();
         for port in ports {
@@ -127,12 +127,17 @@ impl Listener {
                 }
                 Err(error) => tracing::warn!("programs of this user need a token: {}: {error}", path.display()),
             }
+            let path = folder.join(format!("{port}.memory.sock"));
+            let added = create_private_folder(folder).and_then(|()| self.add_shared_memory(&path));
+            if let Err(error) = added {
+                tracing::warn!("programs of this user have no shared memory: {}: {error}", path.display());
+            }
         }
     }
 
     fn add_shared_memory(&mut self, path: &Path) -> io::Result<()> {
         let (socket, file) = SocketFile::bind(path, SocketPermissions::default())?;
-        self.shared_memory = Some(socket);
+        self.shared_memory.push(socket);
         self.files.push(file);
         Ok(())
     }
@@ -498,16 +503,17 @@ mod tests {
         let config = Config { listen, local_sockets: Some(sockets.clone()), state, ..Config::default() };
         let listener = Listener::bind(&config).await.expect("expected sockets");
         let port = listener.addresses[0].port();
-        let path = sockets.join(format!("{port}.sock"));
+        let [path, memory_path] = ["sock", "memory.sock"].map(|extension| sockets.join(format!("{port}.{extension}")));
         assert_eq!(listener.urls()[1], format!("unix:{}", path.display()));
         let mode = |path: &Path| std::fs::metadata(path).expect("expected a file").permissions().mode() & 0o777;
-        assert_eq!((mode(&path), mode(&sockets)), (0o600, 0o700));
+        assert_eq!((mode(&path), mode(&memory_path), mode(&sockets)), (0o600, 0o600, 0o700));
+        assert_eq!(listener.shared_memory.len(), 1);
         drop(listener);
-        assert!(!path.exists());
+        assert!(!path.exists() && !memory_path.exists());
         // Others could replace sockets in this folder, so the server has none there.
         std::fs::set_permissions(&sockets, std::fs::Permissions::from_mode(0o777)).expect("expected new permissions");
         let listener = Listener::bind(&config).await.expect("expected a server without the socket");
-        assert_eq!(listener.urls().len(), 1);
+        assert_eq!((listener.urls().len(), listener.shared_memory.len()), (1, 0));
     }
 
     /// Clients compare the name or address in their URL with the certificate.

@@ -41,6 +41,7 @@ mod stream;
 mod tls;
 mod uploads;
 mod vertices;
+mod views;
 mod web;
 
 use std::sync::Arc;
@@ -101,7 +102,9 @@ pub async fn serve(
     let table = ConnectionTable::new(config.connections, engine.admission());
     let peers = Arc::clone(table.peers());
     let clients = ClientTable { engine: engine.clone(), authenticator: Arc::clone(&authenticator), peers };
-    let routes = routes(&engine, &config, &shared_memory, clients, viewer_urls)?.with(health_server);
+    let has_shared_memory = !listener.shared_memory.is_empty();
+    let info = info::ServerServiceImpl { engine: engine.clone(), clients, viewer_urls, has_shared_memory };
+    let routes = routes(&engine, &config, &shared_memory, info)?.with(health_server);
     let accepts_machines = listener.remote_addresses().next().is_some();
     let web = config.viewer.then(|| {
         let host_name = host_name().filter(|_| accepts_machines);
@@ -110,7 +113,7 @@ pub async fn serve(
     });
     let web = web.transpose()?;
     // The files are removed when this function returns.
-    let Listener { sockets, shared_memory: shared_memory_socket, files: _files, tls, admin, .. } = listener;
+    let Listener { sockets, shared_memory: memory_sockets, files: _files, tls, admin, .. } = listener;
     let connections = ConnectionGauges::default();
     // Its tasks end when this function returns.
     let mut admin_tasks = JoinSet::new();
@@ -122,10 +125,10 @@ pub async fn serve(
     let metrics = engine.admission();
     let connection_server =
         ConnectionServer::new(routes, web, Arc::clone(&authenticator), tls.clone(), connections, &config, metrics);
-    let _shared_memory_server = shared_memory_socket.map(|socket| {
-        let limit = Limit::SHARED_MEMORY;
-        shared_memory.serve(socket, metrics.pool(limit, (limit.total)(&config)))
-    });
+    let memory_limit = Limit::SHARED_MEMORY;
+    let memory_permits = metrics.pool(memory_limit, (memory_limit.total)(&config));
+    let serve_memory = |socket| shared_memory.serve(socket, memory_permits.clone());
+    let _shared_memory_servers: Vec<_> = memory_sockets.into_iter().map(serve_memory).collect();
     let accept_connections = connection_server.accept_connections(sockets, Arc::clone(&table));
     let report_state = report_state(engine.clone(), health.reporter.clone());
     let stop_engine = async move {
@@ -224,6 +227,7 @@ impl Health {
             "FrameService",
             "VertexService",
             "StateService",
+            "ViewService",
             "ForceService",
             "ServerService",
         ];
@@ -238,8 +242,7 @@ fn routes(
     engine: &Engine,
     config: &Config,
     shared_memory: &SharedMemory,
-    clients: ClientTable,
-    viewer_urls: Vec<String>,
+    info: info::ServerServiceImpl,
 ) -> Result<Routes> {
     use v1::force_service_server::ForceServiceServer;
     use v1::frame_service_server::FrameServiceServer;
@@ -248,6 +251,7 @@ fn routes(
     use v1::state_service_server::StateServiceServer;
     use v1::step_service_server::StepServiceServer;
     use v1::vertex_service_server::VertexServiceServer;
+    use v1::view_service_server::ViewServiceServer;
     // A macro, because the generated servers share no trait for these methods.
     macro_rules! with_limits {
         ($server:expr) => {
@@ -261,19 +265,17 @@ fn routes(
     };
     let frame_service = frames::FrameServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let vertex_service = vertices::VertexServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
+    let view_service = views::ViewServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
     let step_service = steps::StepServiceImpl { engine: engine.clone(), shared_memory: shared_memory.clone() };
-    Ok(Routes::new(Arc::clone(&clients.authenticator), config.message_bytes)
+    Ok(Routes::new(Arc::clone(&info.clients.authenticator), config.message_bytes)
         .with(reflection().build_v1().map_err(fault_in("reflection"))?)
         .with(reflection().build_v1alpha().map_err(fault_in("reflection"))?)
-        .with(with_limits!(ServerServiceServer::new(info::ServerServiceImpl {
-            engine: engine.clone(),
-            clients,
-            viewer_urls,
-        })))
+        .with(with_limits!(ServerServiceServer::new(info)))
         .with(with_limits!(SceneServiceServer::new(scenes::SceneServiceImpl(engine.clone()))))
         .with(with_limits!(StepServiceServer::new(step_service)))
         .with(with_limits!(FrameServiceServer::new(frame_service)))
         .with(with_limits!(VertexServiceServer::new(vertex_service)))
+        .with(with_limits!(ViewServiceServer::new(view_service)))
         .with(with_limits!(StateServiceServer::new(states::StateServiceImpl(engine.clone()))))
         .with(with_limits!(ForceServiceServer::new(forces::ForceServiceImpl(engine.clone())))))
 }

@@ -12,7 +12,7 @@ pub(super) enum Requirement {
 }
 
 /// Every method of every service. A method that is not listed is denied.
-const METHODS: [(&str, Requirement); 30] = {
+const METHODS: [(&str, Requirement); 31] = {
     use Requirement::{Public, Role as Requires};
     use Role::{Admin, Drive, Interact, Pixels, Upload, View};
     [
@@ -32,6 +32,7 @@ const METHODS: [(&str, Requirement); 30] = {
         ("modalcast.v1.SceneService/ReadModes", Requires(View)),
         ("modalcast.v1.VertexService/GetVertices", Requires(View)),
         ("modalcast.v1.VertexService/StreamVertices", Requires(View)),
+        ("modalcast.v1.ViewService/DrawViews", Requires(View)),
         ("modalcast.v1.StateService/GetState", Requires(View)),
         ("modalcast.v1.StateService/StreamStates", Requires(View)),
         ("modalcast.v1.ForceService/StreamForces", Requires(View)),

@@ -79,6 +79,7 @@ replies_with_chunk_part! {
     StreamFramesResponse, stream_frames_response, 3;
     StreamStatesResponse, stream_states_response, 3;
     DescribeSceneResponse, describe_scene_response, 5;
+    DrawViewsResponse, draw_views_response, 5;
 }
 
 impl ReplyMessage for v1::GetStateResponse {

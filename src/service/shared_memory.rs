@@ -1,5 +1,5 @@
 //! Memory that clients of the same machine share with the server. `SharedRange` in `common.proto` documents the
-//! protocol. Shared memory is off unless the configuration names a Unix socket.
+//! protocol. There is a Unix socket for each TCP port, and one more if the configuration names one.
 //!
 //! A connection to that socket owns slots for replies and slots for steps, whose memory is bounded: at most
 //! [`crate::admission::Limit::SHARED_MEMORY`] times `2 * SLOT_COUNT * SLOT_BYTES`. Data in slots do not count against the
@@ -7,8 +7,10 @@
 //! slot for a reply waits until its client returns one or the connection ends. The first call that uses a connection
 //! binds it to the principal of the call.
 
+mod device_memory;
 mod reply_memory;
 mod request_memory;
+mod slot_pool;
 
 use std::collections::HashMap;
 use std::io::{self, IoSlice};
@@ -26,8 +28,11 @@ use tokio::net::{UnixListener, UnixStream};
 use tokio::task::{JoinHandle, JoinSet};
 use tonic::metadata::MetadataMap;
 
+pub(super) use self::device_memory::DeviceMemory;
+use self::device_memory::FIRST_DEVICE_SLOT;
 use self::reply_memory::{ReplyMemory, SLOT_BYTES, SLOT_COUNT};
 use self::request_memory::RequestMemory;
+use self::slot_pool::SlotPool;
 use super::peer::Peer;
 use crate::admission::{Account, Permit, PermitPool};
 use crate::engine::lock;
@@ -56,6 +61,8 @@ pub(super) struct SharedMemory {
 struct ConnectionMemory {
     replies: ReplyMemory,
     requests: RequestMemory,
+    /// The slots of device memory, if a call has asked for them.
+    device_slots: OnceLock<Arc<SlotPool>>,
     /// Returns the slots of `requests` to the client.
     returns: OwnedWriteHalf,
     /// The name of the principal whose calls may use this memory, once there has been a call.
@@ -67,7 +74,7 @@ struct ConnectionMemory {
 pub(super) struct SharedMemoryServer(JoinHandle<()>);
 
 /// The shared memory of one call, if the client has asked for it.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct CallMemory(Option<Arc<ConnectionMemory>>);
 
 impl SharedMemory {
@@ -92,6 +99,22 @@ impl SharedMemory {
 }
 
 impl ConnectionMemory {
+    /// The memory of a new connection.
+    fn new(replies: ReplyMemory, requests: RequestMemory, returns: OwnedWriteHalf) -> Self {
+        Self { replies, requests, device_slots: OnceLock::new(), returns, principal: OnceLock::new() }
+    }
+
+    /// Takes a slot back from the client.
+    ///
+    /// # Errors
+    /// `InvalidData` if the client does not have this slot.
+    fn take_back(&self, slot: u32) -> io::Result<()> {
+        match (slot.checked_sub(FIRST_DEVICE_SLOT), self.device_slots.get()) {
+            (Some(slot), Some(device_slots)) => device_slots.take_back(slot),
+            _ => self.replies.take_back(slot),
+        }
+    }
+
     /// Whether the calls of a principal may use this memory. The first principal who asks may.
     fn belongs_to(&self, principal: &Principal) -> bool {
         *self.principal.get_or_init(|| principal.name.clone()) == principal.name
@@ -186,12 +209,11 @@ async fn serve_memory(socket: UnixStream, memory: &SharedMemory, permit: Permit)
     let mut token = Token::default();
     getrandom::fill(&mut token).map_err(io::Error::other)?;
     let (mut slots, returns) = socket.into_split();
-    let registration =
-        Registration::new(memory, token, ConnectionMemory { replies, requests, returns, principal: OnceLock::new() });
+    let registration = Registration::new(memory, token, ConnectionMemory::new(replies, requests, returns));
     send_handshake(slots.as_ref(), token, [reply_file, request_file]).await?;
     loop {
         match slots.read_u32_le().await {
-            Ok(slot) => registration.connection.replies.take_back(slot)?,
+            Ok(slot) => registration.connection.take_back(slot)?,
             Err(error) if is_disconnect(&error) => return Ok(()),
             Err(error) => return Err(error),
         }
@@ -251,6 +273,9 @@ impl Drop for Registration<'_> {
     fn drop(&mut self) {
         lock(&self.memory.connections).remove(&self.token);
         self.connection.replies.close();
+        if let Some(device_slots) = self.connection.device_slots.get() {
+            device_slots.close();
+        }
         // Calls may hold the socket open, but the client learns that the connection has ended.
         shutdown(self.connection.returns.as_ref(), Shutdown::Both).ok();
     }
@@ -278,7 +303,7 @@ mod tests {
         let (replies, _) = ReplyMemory::new(Permit::for_test(Limit::SHARED_MEMORY)).expect("expected memory");
         let (requests, _) = RequestMemory::new().expect("expected memory");
         let (socket, client) = UnixStream::pair().expect("expected sockets");
-        (ConnectionMemory { replies, requests, returns: socket.into_split().1, principal: OnceLock::new() }, client)
+        (ConnectionMemory::new(replies, requests, socket.into_split().1), client)
     }
 
     #[tokio::test]

@@ -63,6 +63,7 @@ mod tolerance;
 mod unix_sockets;
 mod viewer_port;
 mod viewer_sessions;
+mod views;
 mod websocket;
 mod websocket_client;
 mod writers;

@@ -51,7 +51,7 @@ pub(crate) const DEFAULT_WINDOW: u32 = 0;
 
 /// Source of scenes built in code: `strips` (two small domains), `far` (`strips` far from the world origin), `twig`
 /// (with followers), `attributes` (with displacements and boxes), `sheet` (more than 1 MiB per array), `crowd`
-/// (70,000 domains) and `panic` (the loader panics).
+/// (70,000 domains), `shadowless-strips`, `shadowless-twig` and `panic` (the loader panics).
 pub(crate) struct SyntheticScenes;
 
 impl SceneSource for SyntheticScenes {
@@ -63,6 +63,8 @@ impl SceneSource for SyntheticScenes {
             "attributes" => strips_with_attributes(),
             "sheet" => sheet(),
             "crowd" => crowd(),
+            "shadowless-strips" => without_shadows(&strips()),
+            "shadowless-twig" => without_shadows(&twig()),
             "panic" => panic!("intended panic of the loader"),
             _ => return Err(Error::NotFound { what: "scene", given: source.into() }),
         };
@@ -121,6 +123,12 @@ pub(crate) fn strips_with_attributes() -> Arc<Scene> {
     let (shapes, materials) = (vec![shape], vec![Material::default()]);
     Scene::new(SceneParts { shapes, materials, domains, deformation, ..SceneParts::named("attributes") })
         .expect("expected a valid scene")
+}
+
+/// A scene without shadows.
+fn without_shadows(scene: &Scene) -> Arc<Scene> {
+    let look = RenderSettings { shadow: None, ..scene.look };
+    Scene::new(SceneParts { look, ..scene.parts() }).expect("expected a valid scene")
 }
 
 /// 70,000 squares of one shape, more than one part of a vertex layout has.

@@ -6,6 +6,7 @@ use tokio::sync::{oneshot, watch};
 
 use super::context::PreparedDeformer;
 use super::fair_queue::CostClass;
+use super::loaded_worlds::{DrawnViews, ExportedSlots, PreparedWorlds, ViewRequest};
 use crate::engine::output::output_spec::{FrameOutput, PictureContent, PictureSpec};
 use crate::engine::output::rendered_picture::RenderedPicture;
 use crate::engine::output::step_vertices::StepVertices;
@@ -13,6 +14,7 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result};
 use modalcast_model::scene::{CameraSource, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::views::ViewFormat;
 use modalcast_render::PickHit;
 
 /// Identifies a loaded scene on the device thread.
@@ -73,12 +75,7 @@ pub(in crate::engine) enum Command {
         reply: Reply<DeformSummary>,
     },
     /// Draws a picture of the last deformation: colors, or an AOV (arbitrary output variable, such as depth).
-    Draw {
-        id: SceneId,
-        picture: PictureSpec,
-        content: PictureContent,
-        reply: Reply<Arc<RenderedPicture>>,
-    },
+    Draw { id: SceneId, picture: PictureSpec, content: PictureContent, reply: Reply<Arc<RenderedPicture>> },
     /// Finds the surface points at the pixels of a rectangle.
     Pick {
         id: SceneId,
@@ -89,15 +86,23 @@ pub(in crate::engine) enum Command {
         reply: Reply<Vec<PickHit>>,
     },
     /// Copies vertex attributes to the host. The copy overlaps with the commands after it.
-    ReadVertices {
+    ReadVertices { id: SceneId, attributes: VertexAttributes, reply: Reply<Arc<StepVertices>> },
+    /// Loads the worlds of a batch of small views, which belong to no scene on the device.
+    LoadWorlds {
         id: SceneId,
-        attributes: VertexAttributes,
-        reply: Reply<Arc<StepVertices>>,
-    },
-    UnloadScene {
-        id: SceneId,
+        /// All worlds as one scene.
+        worlds: Arc<Scene>,
+        /// Number of domains of one world.
+        domains: usize,
+        prepared: Result<PreparedWorlds>,
         reply: Reply<()>,
     },
+    /// Allocates exported device memory for the views of worlds.
+    ExportRing { id: SceneId, slot_count: usize, format: ViewFormat, views: usize, reply: Reply<Arc<ExportedSlots>> },
+    /// Deforms worlds and draws views of them.
+    DrawViews { id: SceneId, request: ViewRequest, reply: Reply<Arc<DrawnViews>> },
+    /// Unloads a scene or worlds.
+    UnloadScene { id: SceneId, reply: Reply<()> },
 }
 
 impl Command {
@@ -109,6 +114,9 @@ impl Command {
             | Self::Draw { id, .. }
             | Self::Pick { id, .. }
             | Self::ReadVertices { id, .. }
+            | Self::LoadWorlds { id, .. }
+            | Self::ExportRing { id, .. }
+            | Self::DrawViews { id, .. }
             | Self::UnloadScene { id, .. } => *id,
         }
     }
@@ -125,6 +133,11 @@ impl Command {
             }
             Self::Pick { .. } => of_kind("pick"),
             Self::ReadVertices { .. } => of_kind("vertices"),
+            Self::LoadWorlds { .. } => of_kind("load worlds"),
+            Self::ExportRing { .. } => of_kind("export"),
+            Self::DrawViews { request, .. } => {
+                CostClass { kind: "views", size_class: request.views.len().checked_ilog2().unwrap_or(0) }
+            }
             Self::UnloadScene { .. } => of_kind("unload"),
         }
     }
@@ -135,9 +148,10 @@ impl Command {
         !matches!(self, Self::UnloadScene { .. })
     }
 
-    /// Whether the command leaves the queue when its caller no longer waits. The other commands change the scene.
+    /// Whether the command leaves the queue when its caller no longer waits. The other commands change what later commands
+    /// see.
     pub(super) const fn is_cancellable(&self) -> bool {
-        matches!(self, Self::Draw { .. } | Self::Pick { .. } | Self::ReadVertices { .. })
+        matches!(self, Self::Draw { .. } | Self::Pick { .. } | Self::ReadVertices { .. } | Self::DrawViews { .. })
     }
 
     /// Whether the caller of a command that does not change the scene no longer waits.
@@ -146,18 +160,27 @@ impl Command {
             Self::Draw { reply, .. } => reply.is_closed(),
             Self::Pick { reply, .. } => reply.is_closed(),
             Self::ReadVertices { reply, .. } => reply.is_closed(),
-            Self::LoadScene { .. } | Self::Deform { .. } | Self::UnloadScene { .. } => false,
+            Self::DrawViews { reply, .. } => reply.is_closed(),
+            Self::LoadScene { .. }
+            | Self::LoadWorlds { .. }
+            | Self::ExportRing { .. }
+            | Self::Deform { .. }
+            | Self::UnloadScene { .. } => false,
         }
     }
 
     /// Answers the command with an error instead of executing it.
     pub(super) fn reply_error(self, error: Error) {
         match self {
-            Self::LoadScene { reply, .. } | Self::UnloadScene { reply, .. } => reply.send(Err(error)),
+            Self::LoadScene { reply, .. } | Self::LoadWorlds { reply, .. } | Self::UnloadScene { reply, .. } => {
+                reply.send(Err(error))
+            }
             Self::Deform { reply, .. } => reply.send(Err(error)),
             Self::Draw { reply, .. } => reply.send(Err(error)),
             Self::Pick { reply, .. } => reply.send(Err(error)),
             Self::ReadVertices { reply, .. } => reply.send(Err(error)),
+            Self::ExportRing { reply, .. } => reply.send(Err(error)),
+            Self::DrawViews { reply, .. } => reply.send(Err(error)),
         };
     }
 }

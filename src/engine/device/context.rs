@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::loaded_scene::LoadedScene;
+use super::loaded_worlds::LoadedWorlds;
 use crate::config::{BackendChoice, Config, EncodeChoice, RendererChoice};
 use crate::engine::memory_limits::MemoryLimits;
 use crate::engine::output::output_spec::{FrameOutput, PictureContent};
@@ -72,6 +73,11 @@ impl DeformerPreparer {
     #[cfg(test)]
     pub(super) const fn reference() -> Self {
         Self { backend: Backend::Reference, cuda_device: None, create_test_deformer: None }
+    }
+
+    /// The device of the backend `cuda`.
+    pub(super) const fn cuda_device(&self) -> Option<&Arc<gpu::Device>> {
+        self.cuda_device.as_ref()
     }
 
     /// Prepares the deformer of a scene: compiles its kernels, and packs and uploads its tables.
@@ -331,6 +337,15 @@ impl DeviceContext {
     pub fn unload_scene(&mut self, loaded_scene: LoadedScene) {
         let buffers = loaded_scene.into_buffers();
         self.free_buffers(buffers);
+        if let Some(device) = &self.cuda_device {
+            // A lost device reports its error at the next step.
+            device.synchronize("unload").ok();
+        }
+    }
+
+    /// Frees loaded worlds. Waits until CUDA has freed their memory.
+    pub(super) fn unload_worlds(&self, worlds: LoadedWorlds) {
+        drop(worlds);
         if let Some(device) = &self.cuda_device {
             // A lost device reports its error at the next step.
             device.synchronize("unload").ok();

@@ -58,6 +58,7 @@ use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loss::DeviceLossSender;
 use super::in_flight::{InFlight, InFlightQueue, Pollable};
 use super::loaded_scene::LoadedScene;
+use super::loaded_worlds::LoadedWorlds;
 use super::partial_output::{Charge, PartialOutput};
 use super::recovery_limit::RecoveryLimit;
 use super::watchdog::WorkClock;
@@ -68,7 +69,7 @@ use crate::engine::output::step_vertices::StepVertices;
 use crate::telemetry::ms_since;
 use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{VertexAttributes, VertexReadback};
-use modalcast_model::error::{Result, fault, fault_in};
+use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_render::{MAX_FRAMES_IN_FLIGHT, PendingFrame, PendingPick, PickHit};
 
 /// How long the thread waits for a frame of a software renderer before it checks the command queue again.
@@ -100,6 +101,7 @@ pub(super) struct DeviceLoop {
     owners: Arc<WorkOwners>,
     recoveries: RecoveryLimit,
     scenes: HashMap<SceneId, LoadedScene>,
+    worlds: HashMap<SceneId, LoadedWorlds>,
     /// The settings of the loaded scenes, to load them again.
     backends: HashMap<SceneId, BackendSettings>,
     /// Outputs with further draw steps. The queue of their scene begins with [`Work::Continue`].
@@ -169,6 +171,7 @@ impl DeviceLoop {
             owners,
             recoveries: RecoveryLimit::default(),
             scenes: HashMap::new(),
+            worlds: HashMap::new(),
             backends: HashMap::new(),
             partial_outputs: HashMap::new(),
             vertices: InFlightQueue::new(MAX_VERTEX_READBACKS_IN_FLIGHT),
@@ -363,6 +366,23 @@ impl DeviceLoop {
                 });
                 answer(reply, deformed);
             }
+            Command::LoadWorlds { id, worlds, domains, prepared, reply } => {
+                let loaded = prepared.and_then(|prepared| LoadedWorlds::new(&worlds, domains, prepared));
+                let result = self.loss.record_loss(loaded).map(|loaded| drop(self.worlds.insert(id, loaded)));
+                if !reply.send(result) {
+                    self.unload(id);
+                }
+            }
+            Command::ExportRing { id, slot_count, format, views, reply } => {
+                let worlds = self.worlds.get_mut(&id).ok_or_else(|| not_loaded(id));
+                let exported = worlds.and_then(|worlds| worlds.export_ring(slot_count, &format, views));
+                answer(reply, self.loss.record_loss(exported).map(Arc::new));
+            }
+            Command::DrawViews { id, request, reply } => {
+                let worlds = self.worlds.get_mut(&id).ok_or_else(|| not_loaded(id));
+                let drawn = worlds.and_then(|worlds| worlds.draw(&request));
+                answer(reply, self.loss.record_loss(drawn).map(Arc::new));
+            }
             Command::UnloadScene { id, reply } => {
                 self.unload(id);
                 answer(reply, Ok(()));
@@ -382,6 +402,9 @@ impl DeviceLoop {
         self.backends.remove(&id);
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
+        }
+        if let Some(worlds) = self.worlds.remove(&id) {
+            self.context.unload_worlds(worlds);
         }
         self.queue.forget(id);
     }
@@ -514,11 +537,18 @@ impl Drop for DeviceLoop {
         for scene in scenes {
             run_caught(|| self.context.unload_scene(scene));
         }
+        for (_, worlds) in self.worlds.drain() {
+            run_caught(|| self.context.unload_worlds(worlds));
+        }
     }
 }
 
 fn find_scene(scenes: &mut HashMap<SceneId, LoadedScene>, id: SceneId) -> Result<&mut LoadedScene> {
-    scenes.get_mut(&id).ok_or_else(|| fault("device", format!("scene {id} is not loaded")))
+    scenes.get_mut(&id).ok_or_else(|| not_loaded(id))
+}
+
+fn not_loaded(id: SceneId) -> Error {
+    fault("device", format!("scene {id} is not loaded"))
 }
 
 #[cfg(test)]
@@ -531,7 +561,6 @@ mod tests {
     use crate::engine::testing::{self, FaultyDeformer, InjectedFault};
     use crate::hang_guard::HANG_GUARD;
     use modalcast_model::deform::Deformer;
-    use modalcast_model::error::Error;
     use modalcast_model::scene::{Scene, SceneState};
 
     const FAULTY_SCENE: SceneId = 1;

@@ -12,6 +12,7 @@ use super::command_queue::{CancelGuard, CommandQueue};
 use super::context::{DeformerPreparer, DeviceContext, EngineInfo};
 use super::device_loop::DeviceLoop;
 use super::device_loss::{DeviceLoss, device_loss_channel};
+use super::loaded_worlds::{DrawnViews, ExportedSlots, PreparedWorlds, ViewRequest};
 use super::watchdog::{self, WorkClock};
 use super::work_owners::WorkOwners;
 use crate::engine::blocking::run_blocking;
@@ -22,6 +23,7 @@ use modalcast_model::backend_settings::BackendSettings;
 use modalcast_model::deform::{DeformSummary, VertexAttributes};
 use modalcast_model::error::{Error, Result, fault, fault_in};
 use modalcast_model::scene::{CameraSource, FrameSize, PixelRect, Scene, SceneState};
+use modalcast_model::views::{ViewFormat, ViewScene};
 use modalcast_render::PickHit;
 
 /// Sends commands to the device thread. The thread ends when the last clone is dropped.
@@ -151,6 +153,38 @@ impl DeviceHandle {
         loaded
     }
 
+    /// Prepares worlds on another thread, and then loads them on the device thread. `domains`: number of domains of one
+    /// world. `views`: the static data of their views.
+    pub(in crate::engine) async fn load_worlds(
+        &self,
+        id: SceneId,
+        worlds: &Arc<Scene>,
+        domains: usize,
+        views: ViewScene,
+    ) -> Result<()> {
+        let (preparer, prepared_worlds, owners) = (self.preparer.clone(), Arc::clone(worlds), Arc::clone(&self.owners));
+        let prepare = move || owners.run(id, || PreparedWorlds::new(&preparer, &prepared_worlds, views));
+        let prepared = run_blocking("load", prepare).await;
+        let worlds = Arc::clone(worlds);
+        self.call(|reply| Command::LoadWorlds { id, worlds, domains, prepared, reply }).await
+    }
+
+    /// Allocates exported device memory for the views of worlds.
+    pub(in crate::engine) async fn export_ring(
+        &self,
+        id: SceneId,
+        slot_count: usize,
+        format: ViewFormat,
+        views: usize,
+    ) -> Result<Arc<ExportedSlots>> {
+        self.call(|reply| Command::ExportRing { id, slot_count, format, views, reply }).await
+    }
+
+    /// Starts deforming worlds and drawing views of them.
+    pub(in crate::engine) fn draw_views(&self, id: SceneId, request: ViewRequest) -> PendingReply<Arc<DrawnViews>> {
+        self.submit(|reply| Command::DrawViews { id, request, reply })
+    }
+
     /// Starts deforming a scene to a state. `following` is the state that the writer has already sent after it.
     pub(in crate::engine) fn deform(
         &self,
@@ -192,7 +226,7 @@ impl DeviceHandle {
         self.submit(|reply| Command::ReadVertices { id, attributes, reply })
     }
 
-    /// Unloads a scene. A full queue accepts this command, too.
+    /// Unloads a scene or worlds. A full queue accepts this command, too.
     pub(in crate::engine) async fn unload_scene(&self, id: SceneId) -> Result<()> {
         let unloaded = self.call(|reply| Command::UnloadScene { id, reply }).await;
         self.owners.remove(id);

@@ -24,7 +24,7 @@ use modalcast_render::{
 
 /// Positions beyond this bound (scene units) are rejected like infinite ones, because their squares overflow f32 in the
 /// shaders.
-const MAX_COORDINATE: f64 = 1e18;
+pub(super) const MAX_COORDINATE: f64 = 1e18;
 
 /// Size of the frames that are measured to choose between the rasterizers.
 const BENCHMARK_SIZE: FrameSize = FrameSize::new(1920, 1080);
@@ -428,7 +428,7 @@ impl LoadedScene {
 
 /// The origin of all domains: the scene's origin, or one floating origin. The deformer's output is then drawn
 /// unchanged. `None` if the domains have different origins.
-fn uniform_origin(origins: Option<&Arc<FloatingOrigins>>) -> Option<[f64; 3]> {
+pub(in crate::engine) fn uniform_origin(origins: Option<&Arc<FloatingOrigins>>) -> Option<[f64; 3]> {
     match origins {
         Some(origins) => origins.has_no_outliers().then(|| origins.shared_origin()),
         None => Some([0.0; 3]),
@@ -456,7 +456,7 @@ fn no_buffers_error() -> Error {
     fault("draw", "the scene has no buffers")
 }
 
-fn is_in_range(bounds: &BoundingBox) -> bool {
+pub(super) fn is_in_range(bounds: &BoundingBox) -> bool {
     bounds.min.iter().chain(&bounds.max).all(|number| number.abs() <= MAX_COORDINATE)
 }
 

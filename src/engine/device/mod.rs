@@ -14,6 +14,7 @@ mod frame_log;
 pub(super) mod handle;
 mod in_flight;
 pub(super) mod loaded_scene;
+pub(super) mod loaded_worlds;
 mod partial_output;
 mod recovery_limit;
 pub(super) mod scalar_field;

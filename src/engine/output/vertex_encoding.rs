@@ -37,7 +37,7 @@ impl<T: NoUninit> AsRef<[u8]> for NumberBytes<T> {
 }
 
 /// The bytes of a list in memory, without a copy.
-pub(super) fn into_bytes<T: NoUninit + Send>(numbers: Vec<T>) -> Bytes {
+pub(in crate::engine) fn into_bytes<T: NoUninit + Send>(numbers: Vec<T>) -> Bytes {
     Bytes::from_owner(NumberBytes(numbers))
 }
 

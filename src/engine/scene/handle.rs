@@ -21,6 +21,7 @@ use crate::engine::device::command::SceneId;
 use crate::engine::output::output_spec::OutputSpec;
 use crate::engine::output::step_output::{StepId, StepOutput};
 use crate::engine::scene_memory::SceneMemory;
+use crate::engine::scene_not_open;
 use crate::engine::storage::checkpoint_store::SceneCheckpoints;
 use crate::engine::storage::provenance::SceneProvenance;
 use crate::engine::storage::scene_record::{SceneAccess, SceneRight, SharedAccess};
@@ -184,6 +185,16 @@ impl SceneHandle {
                     std::future::pending::<()>().await;
                 }
             }
+        }
+    }
+
+    /// Waits until the scene is closed, and returns the error. Cancel-safe. The future does not keep the scene open.
+    pub fn closed(&self) -> impl Future<Output = Error> + Send + use<> {
+        let (mut access, name) = (self.access.subscribe(), self.name.clone());
+        async move {
+            // The scene owns the sender.
+            while access.changed().await.is_ok() {}
+            scene_not_open(&name)
         }
     }
 

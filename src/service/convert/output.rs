@@ -110,16 +110,25 @@ fn parse_format(frame_output: FrameOutput, picture: &v1::Picture) -> Result<Fram
 
 /// A picture with only the fields of its output.
 pub(super) fn wire_output(output: FrameOutput) -> v1::Picture {
-    let (wire_output, mode, largest) = match output {
-        FrameOutput::Color => (v1::Output::Color, 0, 0.0),
-        FrameOutput::Depth => (v1::Output::Depth, 0, 0.0),
-        FrameOutput::DepthWithGround => (v1::Output::DepthWithGround, 0, 0.0),
-        FrameOutput::Domains => (v1::Output::Domains, 0, 0.0),
-        FrameOutput::Normals => (v1::Output::Normals, 0, 0.0),
-        FrameOutput::Displacement { scale_max } => (v1::Output::Displacement, 0, scale_max),
-        FrameOutput::ModeShape { mode, scale_max } => (v1::Output::ModeShape, mode, scale_max),
+    let (mode, largest) = match output {
+        FrameOutput::Displacement { scale_max } => (0, scale_max),
+        FrameOutput::ModeShape { mode, scale_max } => (mode, scale_max),
+        _ => (0, 0.0),
     };
-    v1::Picture { output: wire_output.into(), mode, largest, ..v1::Picture::default() }
+    v1::Picture { output: wire_frame_output(output).into(), mode, largest, ..v1::Picture::default() }
+}
+
+/// The name of an output.
+pub(in crate::service) const fn wire_frame_output(output: FrameOutput) -> v1::Output {
+    match output {
+        FrameOutput::Color => v1::Output::Color,
+        FrameOutput::Depth => v1::Output::Depth,
+        FrameOutput::DepthWithGround => v1::Output::DepthWithGround,
+        FrameOutput::Domains => v1::Output::Domains,
+        FrameOutput::Normals => v1::Output::Normals,
+        FrameOutput::Displacement { .. } => v1::Output::Displacement,
+        FrameOutput::ModeShape { .. } => v1::Output::ModeShape,
+    }
 }
 
 pub(crate) const fn wire_format(format: FrameFormat) -> v1::Format {

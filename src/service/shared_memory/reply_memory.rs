@@ -2,16 +2,14 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
-use std::sync::Mutex;
 
 use bytes::Bytes;
 use memmap2::{MmapOptions, MmapRaw};
 use modalcast_proto::v1;
 use rustix::fs::{MemfdFlags, SealFlags, fcntl_add_seals, ftruncate, memfd_create};
-use tokio::sync::Semaphore;
 
+use super::slot_pool::SlotPool;
 use crate::admission::Permit;
-use crate::engine::lock;
 
 /// Size of a slot in bytes: the largest chunk of a reply.
 pub(super) const SLOT_BYTES: usize = 1 << 20;
@@ -28,19 +26,9 @@ const MIN_SHARED_BYTES: usize = 64 << 10;
 #[derive(Debug)]
 pub(in crate::service) struct ReplyMemory {
     mapping: MmapRaw,
-    slots: Mutex<Slots>,
-    /// One permit for each free slot. Closed when the connection has ended.
-    free_slots: Semaphore,
+    slots: SlotPool,
     /// Counts the connection against the limit on connections.
     _permit: Permit,
-}
-
-#[derive(Debug)]
-struct Slots {
-    /// Free slots. The last one is used next, because its memory is most likely in a cache.
-    free: Vec<u32>,
-    /// Whether each slot is lent to the client.
-    is_lent: [bool; SLOT_COUNT],
 }
 
 impl ReplyMemory {
@@ -52,9 +40,7 @@ impl ReplyMemory {
         let mapping = MmapOptions::new().len(SLOT_COUNT * SLOT_BYTES).map_raw(&file)?;
         // The mapping above remains writable.
         fcntl_add_seals(&file, SealFlags::SHRINK | SealFlags::GROW | SealFlags::FUTURE_WRITE | SealFlags::SEAL)?;
-        let slots = Slots { free: (0..SLOT_COUNT as u32).rev().collect(), is_lent: [false; SLOT_COUNT] };
-        let free_slots = Semaphore::new(SLOT_COUNT);
-        Ok((Self { mapping, slots: Mutex::new(slots), free_slots, _permit: permit }, file))
+        Ok((Self { mapping, slots: SlotPool::new(SLOT_COUNT), _permit: permit }, file))
     }
 
     /// Copies data into a free slot, which belongs to the client until it returns the slot. Waits for a free slot.
@@ -63,11 +49,9 @@ impl ReplyMemory {
         if !(MIN_SHARED_BYTES..=SLOT_BYTES).contains(&data.len()) {
             return None;
         }
-        self.free_slots.acquire().await.ok()?.forget();
-        let slot = lock(&self.slots).free.pop()?;
+        let slot = self.slots.take().await?;
         self.write(slot as usize, data);
-        // Mark the slot after the copy, because a client could otherwise guess the slot and return it during the copy.
-        *lock(&self.slots).is_lent.get_mut(slot as usize)? = true;
+        self.slots.lend(slot);
         Some(v1::SharedRange { slot, bytes: std::mem::take(data).len() as u32 })
     }
 
@@ -75,8 +59,8 @@ impl ReplyMemory {
     fn write(&self, slot: usize, data: &[u8]) {
         let bytes = data.len().min(SLOT_BYTES);
         // SAFETY: `slot` comes from the list of free slots, so it is below SLOT_COUNT and its SLOT_BYTES are within the
-        // mapping, which lives as long as `self`. No other thread writes to the slot: it is in no list, and `take_back`
-        // does not accept it before this copy has ended. This process never reads the mapping, and has no reference to
+        // mapping, which lives as long as `self`. No other thread writes to the slot: it was taken, and `take_back` does
+        // not accept it before it is lent, after this copy. This process never reads the mapping, and has no reference to
         // the mapping's bytes: `data` is other memory.
         unsafe {
             let target = self.mapping.as_mut_ptr().add(slot * SLOT_BYTES);
@@ -89,20 +73,12 @@ impl ReplyMemory {
     /// # Errors
     /// `InvalidData` if the client does not have this slot.
     pub(super) fn take_back(&self, slot: u32) -> io::Result<()> {
-        let mut slots = lock(&self.slots);
-        if !slots.is_lent.get_mut(slot as usize).is_some_and(std::mem::take) {
-            let reason = format!("expected a slot that was sent and not returned, got {slot}");
-            return Err(io::Error::new(io::ErrorKind::InvalidData, reason));
-        }
-        slots.free.push(slot);
-        drop(slots);
-        self.free_slots.add_permits(1);
-        Ok(())
+        self.slots.take_back(slot)
     }
 
     /// Ends the use of the memory for further data.
     pub(super) fn close(&self) {
-        self.free_slots.close();
+        self.slots.close();
     }
 }
 
