@@ -27,6 +27,7 @@ from modalcast.v1 import (
     states_pb2,
     steps_pb2,
     vertices_pb2,
+    views_pb2,
 )
 
 FILES: list[FileDescriptor] = [
@@ -41,6 +42,7 @@ FILES: list[FileDescriptor] = [
         states_pb2,
         steps_pb2,
         vertices_pb2,
+        views_pb2,
     )
 ]
 METHODS = {value.path: value for value in vars(_methods).values() if isinstance(value, _methods.Method)}
@@ -147,6 +149,13 @@ def use_steps(scene: mc.Scene) -> None:
     scene.state(step=step)
 
 
+def use_views(scene: mc.Scene) -> None:
+    with scene.views(worlds=2, size=8) as views:
+        views.step(np.zeros((2, scene.coordinate_count)))
+        with pytest.raises(mc.InvalidRequest):
+            views.step(np.full((2, scene.coordinate_count), np.nan))
+
+
 def use_every_call(client: mc.Client, folder: Path) -> None:
     assert "tree" in client.scenes().sources
     assert any(listed.is_caller for listed in client.clients())
@@ -162,6 +171,7 @@ def use_every_call(client: mc.Client, folder: Path) -> None:
     scene.describe(["modes"], cache=str(folder / "cache"))
     use_steps(scene)
     use_pictures(scene)
+    use_views(scene)
     scene.reset()
     scene.delete()
 
@@ -188,6 +198,7 @@ def test_every_call_and_message_of_the_contract_is_used(
         return {message.full_name for message in messages.values()}
 
     expected_messages = set[str]().union(*(names(dict(file.message_types_by_name)) for file in FILES))
-    # This client uses no shared memory and ends no other one, and no scene of the server fails.
-    unused = {"SharedRange", "FailedScene", "EndClientResponse"}
+    # The pictures of this test are too small for shared memory, the server has no GPU, this client ends no other one,
+    # and no scene of the server fails.
+    unused = {"SharedRange", "DeviceSlots", "DeviceViews", "FailedScene", "EndClientResponse"}
     assert expected_messages - recorder.messages == {f"modalcast.v1.{name}" for name in unused}

@@ -11,7 +11,8 @@ from modalcast._sync.drive import Drive
 from modalcast._sync.modeling import make_model
 from modalcast._sync.scene import Scene
 from modalcast._sync.streams import FrameBatchStream, FrameStream, Stream
-from modalcast.camera import Camera, at_pose, look_at, pinhole
+from modalcast._sync.views import ViewBatchStream, Views
+from modalcast.camera import Camera, CameraPoses, at_pose, look_at, pinhole
 from modalcast.errors import (
     AlreadyExists,
     ConnectionLost,
@@ -51,6 +52,7 @@ __all__ = [
     "AlreadyExists",
     "AppliedForce",
     "Camera",
+    "CameraPoses",
     "Client",
     "ConnectionLost",
     "DeadlineExceeded",
@@ -95,7 +97,9 @@ __all__ = [
     "Unauthenticated",
     "Unavailable",
     "VertexSet",
+    "ViewBatchStream",
     "ViewerLink",
+    "Views",
     "WorldPose",
     "at_pose",
     "connect",

@@ -105,11 +105,14 @@ class Route:
         target: The target of connections.
         metadata: Sent with every call: the token, if there is one, and the metadata of the caller.
         credentials: The certificates of an encrypted connection; None: it is plain.
+        memory_socket: The socket at which a server of this user on this machine offers shared memory; None: there is
+            none.
     """
 
     target: str
     metadata: tuple[tuple[str, str], ...] = ()
     credentials: grpc.ChannelCredentials | None = None
+    memory_socket: Path | None = None
 
 
 def route_to(address: str, options: ConnectOptions) -> Route:
@@ -129,16 +132,18 @@ def route_to(address: str, options: ConnectOptions) -> Route:
     for name, value in metadata:
         if not (_is_text(name) and name == name.lower() and value.isascii() and value.isprintable()):
             raise ValueError(f"metadata: expected lower-case names and values of visible ASCII letters, got '{name}'")
+    memory_socket = _local_socket(target, "memory.sock")
     token = options.token
     path = os.environ.get("MODALCAST_TOKEN_FILE")
     if token is None and path and not target.startswith("unix:"):
         token = Path(path).read_text().strip()
     if token is None:
-        socket_path = None if credentials else _local_socket(target)
-        return Route(target if socket_path is None else f"unix:{socket_path}", metadata, credentials)
+        socket_path = None if credentials else _local_socket(target, "sock")
+        path = target if socket_path is None else f"unix:{socket_path}"
+        return Route(path, metadata, credentials, memory_socket)
     if not _is_text(token):
         raise ValueError("token: expected visible ASCII letters, got another text")
-    return Route(target, (*metadata, ("authorization", f"Bearer {token}")), credentials)
+    return Route(target, (*metadata, ("authorization", f"Bearer {token}")), credentials, memory_socket)
 
 
 def _is_text(text: str) -> bool:
@@ -163,15 +168,18 @@ def _credentials(address: str, options: ConnectOptions) -> grpc.ChannelCredentia
     return grpc.ssl_channel_credentials(*contents)
 
 
-def _local_socket(target: str) -> Path | None:
-    """The socket of a running server of this user at HOST:PORT. Others cannot create one in a folder of this user."""
+def _local_socket(target: str, extension: str) -> Path | None:
+    """A socket of a running server of this user at HOST:PORT: "sock" for calls, "memory.sock" for shared memory.
+
+    Others cannot create one in a folder of this user.
+    """
     host, _, port = target.rpartition(":")
     if host not in ("localhost", "[::1]") and not host.startswith("127."):
         return None
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state")
     folder = Path(runtime) / "modalcast" if runtime else state / "modalcast/run"
-    path = folder / f"{port}.sock"
+    path = folder / f"{port}.{extension}"
     try:
         of_folder, of_socket = folder.lstat(), path.lstat()
     except OSError:

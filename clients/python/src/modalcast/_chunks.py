@@ -14,7 +14,7 @@ from modalcast._wire import split_data, submessage
 from modalcast.errors import MalformedReply
 
 REPLY_LIMIT = 1 << 30
-"""Largest reply that is assembled, in bytes."""
+"""Largest reply that is assembled, in bytes. Memory of the caller may be larger."""
 
 HeadT = TypeVar("HeadT", bound=Message)
 ChunkT = TypeVar("ChunkT", bound=Message)
@@ -59,8 +59,9 @@ class Assembly:
     """The bytes of one reply, which arrive in order: first those of `target`, then those of `bytes`."""
 
     def __init__(self, name: str, total: int, target: Bytes) -> None:
-        if not len(target) <= total <= REPLY_LIMIT:
-            raise malformed(f"{name}.total", f"{len(target)} to {REPLY_LIMIT} bytes", str(total))
+        limit = max(REPLY_LIMIT, len(target))
+        if not len(target) <= total <= limit:
+            raise malformed(f"{name}.total", f"{len(target)} to {limit} bytes", str(total))
         self._name = name
         self._target = target
         self.total = total

@@ -15,6 +15,7 @@ from modalcast.v1 import (
     states_pb2,
     steps_pb2,
     vertices_pb2,
+    views_pb2,
 )
 
 PROTOCOL_VERSION = 2
@@ -75,3 +76,4 @@ GET_STATE = _method("StateService/GetState", states_pb2.GetStateRequest, states_
 STREAM_STATES = _method("StateService/StreamStates", states_pb2.StreamStatesRequest, states_pb2.StreamStatesResponse)
 APPLY_FORCES = _method("ForceService/ApplyForces", forces_pb2.ApplyForcesRequest, forces_pb2.ApplyForcesResponse)
 STREAM_FORCES = _method("ForceService/StreamForces", forces_pb2.StreamForcesRequest, forces_pb2.StreamForcesResponse)
+DRAW_VIEWS = _method("ViewService/DrawViews", views_pb2.DrawViewsRequest, views_pb2.DrawViewsResponse)

@@ -1,9 +1,10 @@
-"""Progress of a step stream: steps in flight, acknowledgments and rejections."""
+"""Progress of streams of steps. Of a drive: steps in flight, acknowledgments and rejections."""
 
 from __future__ import annotations
 
 import contextlib
 from collections import deque
+from typing import Any, Protocol
 
 from modalcast._common import stage_times
 from modalcast.errors import Error, ServerError, from_rejection
@@ -12,8 +13,26 @@ from modalcast.v1 import steps_pb2
 _MAX_REJECTIONS = 1024
 
 
+class StreamProgress(Protocol):
+    """The state that the replies of a stream change.
+
+    Attributes:
+        end: The error that ended the stream; None while it is open.
+    """
+
+    end: Error | None
+
+    def add(self, reply: Any) -> bool:
+        """Applies a reply of the server. Returns whether this may end the wait for a step.
+
+        Raises:
+            MalformedReply: The reply contradicts the contract.
+        """
+        ...
+
+
 class Progress:
-    """Progress of a step stream.
+    """Progress of a drive.
 
     Attributes:
         in_flight: Numbers of the sent steps that were neither acknowledged nor rejected, oldest first.
@@ -36,8 +55,8 @@ class Progress:
         self.stages: dict[str, float] = {}
         self.end: Error | None = None
 
-    def add(self, reply: steps_pb2.DriveSceneResponse) -> None:
-        """Applies a reply of the server."""
+    def add(self, reply: steps_pb2.DriveSceneResponse) -> bool:
+        """Applies a reply of the server. Returns True, because each reply may end the wait for a step."""
         if reply.HasField("ack"):
             while self.in_flight and self.in_flight[0] <= reply.ack.step:
                 self.in_flight.popleft()
@@ -51,6 +70,7 @@ class Progress:
             self.discard(rejection.step)
             self.rejected += 1
             self.rejections.append(rejection)
+        return True
 
     def discard(self, number: int | None) -> None:
         """Removes a step from the steps in flight."""

@@ -27,7 +27,7 @@ def to_f32(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> F32:
     Raises:
         ValueError: The array has another shape, or a number exceeds the range of f32.
     """
-    given = _real_array(name, values)
+    given = real_array(name, values)
     check_shape(name, given, shape)
     with np.errstate(over="ignore"):
         converted = np.ascontiguousarray(given, dtype="<f4")
@@ -44,7 +44,7 @@ def to_f64(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> F64:
     Raises:
         ValueError: The array has another shape.
     """
-    given = _real_array(name, values)
+    given = real_array(name, values)
     check_shape(name, given, shape)
     return np.ascontiguousarray(given, dtype="<f8")
 
@@ -79,7 +79,7 @@ def affine(name: str, transforms: ArrayLike, leading: tuple[int, ...] = ()) -> F
     Raises:
         ValueError: The array has another shape, or the last row of a 4x4 matrix is not 0 0 0 1.
     """
-    matrices = _real_array(name, transforms)
+    matrices = real_array(name, transforms)
     square_shape, shape = (*leading, 4, 4), (*leading, 3, 4)
     if matrices.shape == square_shape:
         last_rows = matrices[..., 3, :]
@@ -93,7 +93,12 @@ def affine(name: str, transforms: ArrayLike, leading: tuple[int, ...] = ()) -> F
     return to_f32(name, matrices, shape)
 
 
-def _real_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
+def real_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """Converts to an array of real numbers of any type and shape.
+
+    Raises:
+        ValueError: The values are no such array.
+    """
     try:
         array: NDArray[np.generic] = np.asarray(values)
     except ValueError as error:  # rows of different lengths

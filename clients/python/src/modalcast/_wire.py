@@ -6,7 +6,7 @@ a view of the message as gRPC has received it, and data to send are copied once,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from google.protobuf.message import DecodeError
 
@@ -17,6 +17,11 @@ _FIXED_BYTES = {1: 8, 5: 4}
 def length_prefix(field: int, length: int) -> bytes:
     """What precedes the content of a field of `length` bytes: its key and its length."""
     return _encode_varint(field << 3 | _LENGTH_DELIMITED) + _encode_varint(length)
+
+
+def message_of_field(field: int, content: Sequence[bytes | memoryview]) -> bytes:
+    """A message with one field, whose content is copied once."""
+    return b"".join([length_prefix(field, sum(len(piece) for piece in content)), *content])
 
 
 def _encode_varint(value: int) -> bytes:

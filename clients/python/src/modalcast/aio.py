@@ -5,6 +5,7 @@ from modalcast._async.drive import Drive
 from modalcast._async.modeling import make_model
 from modalcast._async.scene import Scene
 from modalcast._async.streams import FrameBatchStream, FrameStream, Stream
+from modalcast._async.views import ViewBatchStream, Views
 
 __all__ = [
     "Client",
@@ -14,6 +15,8 @@ __all__ = [
     "Scene",
     "SceneList",
     "Stream",
+    "ViewBatchStream",
+    "Views",
     "connect",
     "make_model",
     "spawn",

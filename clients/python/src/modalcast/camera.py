@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from modalcast._types import Vector, to_f64, vector3
+from modalcast._types import F64, Vector, real_array, to_f64, vector3
+from modalcast._wire import length_prefix
 from modalcast.v1 import frames_pb2
 
 # Columns 1 and 2 of a pose change their sign between the axes of OpenCV (y down, z forward) and OpenGL (y up, z back).
@@ -44,6 +45,57 @@ class Camera:
         message.CopyFrom(self.message)
         message.near, message.far = near, far
         return replace(self, message=message)
+
+
+@dataclass(frozen=True, eq=False)
+class CameraPoses:
+    """Many cameras with the same lens, for views: arrays in place of one `Camera` for each view.
+
+    Attributes:
+        world_from_camera: C poses, C x 3 x 4 or C x 4 x 4, translations in scene units.
+        lens: Vertical angle in degrees, 0.1 to 179; or a camera whose lens, near plane and far plane all cameras have.
+        convention: Axes of the cameras: "opengl" (x right, y up, looking along -z) or "opencv" (x right, y down,
+            looking along z).
+
+    Raises:
+        ValueError: The array has another shape, or the convention is unknown.
+    """
+
+    world_from_camera: ArrayLike
+    lens: float | Camera = 45.0
+    convention: str = "opengl"
+    _matrices: F64 = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Converts the poses to the axes of OpenGL."""
+        matrices = real_array("world_from_camera", self.world_from_camera).astype("<f8")
+        if matrices.ndim != 3 or matrices.shape[1:] not in ((3, 4), (4, 4)):
+            raise ValueError(f"world_from_camera: expected shape (n, 3, 4) or (n, 4, 4), got {matrices.shape}")
+        if self.convention not in ("opengl", "opencv"):
+            raise ValueError(f"convention: expected 'opencv' or 'opengl', got '{self.convention}'")
+        axes = _OPENGL_FROM_OPENCV if self.convention == "opencv" else 1.0
+        object.__setattr__(self, "_matrices", np.ascontiguousarray(matrices[:, :3] * axes))
+
+    def __len__(self) -> int:
+        return len(self._matrices)
+
+    def encode(self, number: int) -> bytes:
+        """The cameras as a repeated field of a message, without an object for each camera."""
+        lens = frames_pb2.Camera()
+        if isinstance(self.lens, Camera):
+            lens.CopyFrom(self.lens.message)
+            lens.ClearField("look_at")
+            lens.ClearField("pose")
+        else:
+            lens.field_of_view = self.lens
+        end = np.frombuffer(lens.SerializeToString(), np.uint8)
+        poses = self._matrices.reshape(len(self), -1).view(np.uint8)
+        entries = length_prefix(frames_pb2.Pose.WORLD_FROM_CAMERA_FIELD_NUMBER, poses.shape[1])
+        pose = length_prefix(frames_pb2.Camera.POSE_FIELD_NUMBER, len(entries) + poses.shape[1])
+        camera = length_prefix(number, len(pose) + len(entries) + poses.shape[1] + len(end))
+        start = np.frombuffer(camera + pose + entries, np.uint8)
+        rows = [np.broadcast_to(start, (len(self), len(start))), poses, np.broadcast_to(end, (len(self), len(end)))]
+        return np.concatenate(rows, axis=1).tobytes()
 
 
 def look_at(eye: Vector, target: Vector, up: Vector | None = None, field_of_view: float = 45.0) -> Camera:

@@ -78,26 +78,28 @@ class Kinematics:
         """Computes the transforms of domains that `dependents` has returned, from those of all others.
 
         Args:
-            world: world_from_domain of every domain, 4x4, which receives the result.
-            q: All coordinates of the scene.
+            world: world_from_domain of every domain, ... x D x 4 x 4, which receives the result.
+            q: All coordinates of the scene, ... x r. The leading dimensions are those of `world`.
             dependents: The domains to compute.
         """
         local = self._frames[dependents]
         joints = self._joint_of[dependents]
         has_fit = joints >= 0
         if has_fit.any():
-            local[has_fit] = self._fit(q, joints[has_fit]) @ local[has_fit]
+            local = np.tile(local, (*q.shape[:-1], 1, 1, 1))
+            local[..., has_fit, :, :] = self._fit(q, joints[has_fit]) @ local[..., has_fit, :, :]
         for level in self._tree.levels(dependents):
             domains = dependents[level]
-            world[domains] = world[self._tree.sources[domains]] @ local[level]
+            sources = world[..., self._tree.sources[domains], :, :]
+            world[..., domains, :, :] = sources @ local[..., level, :, :]
 
     def _fit(self, q: F32, joints: Indices) -> F64:
-        """The fitted rigid transforms of joints, 4x4."""
-        values = q[self._coordinates[joints]].astype(np.float64)
-        moments = self._rest_moments[joints] + (values[:, None] @ self._mode_moments[joints])[:, 0]
-        rotations = nearest_rotations(moments[:, 3:].reshape(-1, 3, 3))
-        translations = moments[:, :3] - (rotations @ self._rest_means[joints][:, :, None])[..., 0]
-        return square(np.concatenate((rotations, translations[:, :, None]), axis=2))
+        """The fitted rigid transforms of k joints, ... x k x 4 x 4."""
+        values = q[..., self._coordinates[joints]].astype(np.float64)
+        moments = self._rest_moments[joints] + (values[..., None, :] @ self._mode_moments[joints])[..., 0, :]
+        rotations = nearest_rotations(moments[..., 3:].reshape(*moments.shape[:-1], 3, 3))
+        translations = moments[..., :3] - (rotations @ self._rest_means[joints][:, :, None])[..., 0]
+        return square(np.concatenate((rotations, translations[..., None]), axis=-1))
 
     def _parent(self, index: int) -> Domain:
         parent = self._layout.domains[index].parent
@@ -185,10 +187,10 @@ class _DomainTree:
 
 
 def nearest_rotations(correlations: F64) -> F64:
-    """The proper rotations nearest to 3x3 matrices; the identity for matrices of rank 0 or 1."""
+    """The proper rotations nearest to matrices, ... x 3 x 3; the identity for matrices of rank 0 or 1."""
     left, singular_values, right = np.linalg.svd(correlations)
     # If the orthogonal factor is a reflection, flip the direction of the smallest singular value.
-    left[:, :, 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))[:, None]
+    left[..., 2] *= np.sign(np.linalg.det(left) * np.linalg.det(right))[..., None]
     rotations = left @ right
-    rotations[singular_values[:, 1] <= _COLLINEAR * singular_values[:, 0]] = np.eye(3)
+    rotations[singular_values[..., 1] <= _COLLINEAR * singular_values[..., 0]] = np.eye(3)
     return rotations

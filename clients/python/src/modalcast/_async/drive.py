@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 
 from modalcast._async.streams import with_reconnect
 from modalcast._async.transport import StepStream, Transport
+from modalcast._chunks import malformed
 from modalcast._common import Delivery, StepId, delivery_message, stall_budget_milliseconds
 from modalcast._step_message import StepMessage
-from modalcast.errors import ConnectionLost
+from modalcast.errors import ConnectionLost, from_rejection
 from modalcast.kinematics import Kinematics
 from modalcast.states import SceneState, StateLayout
 from modalcast.step_values import Coordinates, StepValues, Transforms, rest_values, to_time
@@ -278,16 +279,20 @@ class Drive:
         )
         stream = self._transport.step_stream()
         try:
-            opened = await stream.open(request, self._timeout)
+            reply = await stream.open(steps_pb2.DriveSceneRequest(open=request).SerializeToString(), self._timeout)
+            if reply.HasField("rejection"):
+                raise from_rejection(reply.rejection)
+            if not reply.HasField("opened"):
+                raise malformed("drive.opened", "`opened` first", "another message")
         except BaseException:
             stream.cancel()
             raise
         if self._opened_stream is not None:
             self._opened_stream.cancel()
         self._opened_stream = stream
-        self.run = opened.run
-        self.lease_token = opened.lease_token
-        return opened.initial_state == steps_pb2.INITIAL_STATE_RESET
+        self.run = reply.opened.run
+        self.lease_token = reply.opened.lease_token
+        return reply.opened.initial_state == steps_pb2.INITIAL_STATE_RESET
 
     async def _load_state(self) -> None:
         """Takes the first values from the current state of the server."""

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from modalcast._async.describe import read_attachments, read_description, read_modes
 from modalcast._async.drive import Drive, DriveOptions
 from modalcast._async.streams import FrameBatchStream, FrameStream, Stream, read_reply, with_reconnect
 from modalcast._async.transport import ReplyStream, Transport
+from modalcast._async.views import ViewBatchStream, Views
 from modalcast._channel import deadline_ms
 from modalcast._chunks import malformed
 from modalcast._common import Delivery, StepId, delivery_message, step_id, step_selector
@@ -41,6 +46,7 @@ from modalcast.frame import ColorFormat, Frame, Outputs, PictureOptions, picture
 from modalcast.kinematics import Kinematics
 from modalcast.scene_description import ArrayName, Domain, Domains, SceneDescription
 from modalcast.states import SceneState, StateLayout
+from modalcast.step_values import rest_values
 from modalcast.v1 import (
     common_pb2,
     forces_pb2,
@@ -53,6 +59,19 @@ from modalcast.v1 import (
 )
 from modalcast.vertices import Attributes, VertexSet, output_bytes, vertex_selection
 from modalcast.viewer import ViewerLink, viewer_link
+from modalcast.views import (
+    StateProgress,
+    StateTable,
+    ViewArrays,
+    ViewCameras,
+    ViewOptions,
+    ViewOutputs,
+    ViewSize,
+    batch_size_of,
+    device_slots_of,
+    report_progress,
+    view_options,
+)
 
 if TYPE_CHECKING:
     from modalcast._async.client import Client
@@ -425,6 +444,152 @@ class Scene:
         await stream.start()
         return stream
 
+    async def views(
+        self,
+        cameras: ViewCameras | None = None,
+        *,
+        worlds: int = 1,
+        camera_worlds: ArrayLike | None = None,
+        size: ViewSize | None = None,
+        outputs: ViewOutputs = ("color",),
+        device: str | None = None,
+        slots: int = 4,
+        timeout: float | None = None,
+    ) -> Views:
+        """Opens copies of the scene (worlds), of which each step draws small pictures (views), for closed loops.
+
+        The worlds begin at rest and belong to this call: nobody else sees them, and the scene and its writer remain as
+        they are. A view has one sample per pixel, and no shadows, ambient occlusion or antialiasing. A step has at most
+        65,536 views.
+
+        Args:
+            cameras: One or several; None: one that frames the rest bounds of a world.
+            worlds: Number of worlds, 1 to 65,536.
+            camera_worlds: The index of the world of each camera; None: every camera sees every world.
+            size: Side of a view or (width, height) in pixels, 1 to 1024; None: that of a pinhole camera, or 64.
+            outputs: One or several of "color", "depth" or "depth_with_ground", "domains" and "normals".
+            device: None: the pictures are arrays of numpy. "cuda": they are `DeviceArray`s on the GPU of the server, of
+                which torch, cupy and jax make tensors without a copy. The server runs on this machine, for this user.
+            slots: With a device, the number of steps whose arrays can exist at a time, 2 to 16.
+            timeout: Default time limit of the calls of `Views`, in seconds.
+
+        Raises:
+            ValueError: An argument is invalid.
+            InvalidRequest: The scene has materials or settings that views do not have.
+            Unavailable: The server does not draw views, or not in memory of a GPU that this process sees.
+            Error: The call failed.
+        """
+        options = view_options(worlds, cameras, camera_worlds, size, outputs, device_slots_of(device, slots))
+        time_limit = self._time_limit(timeout)
+        return await with_reconnect(self._transport, self._reconnect, lambda: self._open_views(options, time_limit))
+
+    async def render_states(
+        self,
+        q: ArrayLike | None = None,
+        transforms: ArrayLike | None = None,
+        *,
+        cameras: ViewCameras | None = None,
+        size: ViewSize | None = None,
+        outputs: ViewOutputs = ("color",),
+        joints: bool = True,
+        batch_size: int | None = None,
+        out: Mapping[str, NDArray[Any]] | None = None,
+        progress: bool | StateProgress = False,
+        timeout: float | None = None,
+    ) -> ViewArrays:
+        """Draws small pictures of any number of states, as `views` does. The scene and its writer remain as they are.
+
+        Args:
+            q: All coordinates of N states, N x r, in the order of `SceneState.q`; None: at rest.
+            transforms: world_from_domain of N states: N x R x 3 x 4 for the R domains that follow no other one, in the
+                order of `domains`, or N x 3 x 4 if R is 1; or 4 x 4 in place of 3 x 4. Translations are in scene units
+                relative to the scene's origin. None: at rest.
+            cameras: C cameras, which see every state; None: one that frames the rest bounds of the scene.
+            size: Side of a picture or (width, height) in pixels, 1 to 1024; None: that of a pinhole camera, or 64.
+            outputs: One or several of "color", "depth" or "depth_with_ground", "domains" and "normals".
+            joints: Whether to compute the transforms of attached domains, so that they move with their parents. Those
+                in `transforms` are then ignored.
+            batch_size: Number of states that the server draws at a time; None: as many as are efficient.
+            out: Arrays that receive the pictures, by output, such as `numpy.memmap`: writable and C-contiguous, of the
+                shapes and types below.
+            progress: True: a progress bar of tqdm, if it is installed; or a function that is called with the number of
+                states that are drawn and N.
+            timeout: Seconds without a reply of the server after which the call fails; None: that of the client.
+
+        Returns:
+            By output, in the order of the states: color N x C x H x W x 3 of uint8, sRGB; depth N x C x H x W of
+            float32, meters along the view axis, infinity where nothing is; domains N x C x H x W of int32, the index of
+            the domain, -1 where none is; normals N x C x H x W x 3 of float32, unit vectors in world axes, zeros where
+            nothing is. `numpy.moveaxis(color, -1, 2)` has the channels first. With `out`, these are its arrays.
+
+        Raises:
+            ValueError: An array has another shape or type, or a number is not finite.
+            ImportError: `progress` is True, and tqdm is not installed.
+            Error: As for `views`.
+        """
+        states, options = await self._states(q, transforms, cameras, size, outputs, joints, batch_size, timeout)
+        leading = states.count, options.camera_count
+        arrays = options.format.arrays(leading, out)
+        with report_progress(progress, states.count) as report:
+            stream = await self._batches(states, options, arrays, timeout)
+            async with stream:
+                async for drawn, _ in stream:
+                    report(drawn.stop)
+        return arrays
+
+    async def iter_states(
+        self,
+        q: ArrayLike | None = None,
+        transforms: ArrayLike | None = None,
+        *,
+        cameras: ViewCameras | None = None,
+        size: ViewSize | None = None,
+        outputs: ViewOutputs = ("color",),
+        joints: bool = True,
+        batch_size: int | None = None,
+        timeout: float | None = None,
+    ) -> ViewBatchStream:
+        """Draws small pictures of any number of states, batch by batch, in bounded memory.
+
+        Each item is a slice of the states, and the dict that `render_states` would return for them. Its arrays are new.
+        `q` and `transforms` must not change during the iteration.
+
+        Args:
+            q, transforms, cameras, size, outputs, joints, timeout: As for `render_states`.
+            batch_size: Number of states of a batch; None: as many as are efficient.
+
+        Raises:
+            Error: As for `render_states`.
+        """
+        states, options = await self._states(q, transforms, cameras, size, outputs, joints, batch_size, timeout)
+        return await self._batches(states, options, None, timeout)
+
+    async def joint_transforms(
+        self, q: ArrayLike, transforms: ArrayLike | None = None, *, timeout: float | None = None
+    ) -> F32:
+        """The transforms with which attached domains move with their parents, for `Views.step`.
+
+        Args:
+            q: All coordinates of N states, N x r.
+            transforms: world_from_domain of N states, as for `render_states`; those of attached domains are ignored.
+                None: at rest.
+            timeout: In seconds; None: that of the client.
+
+        Returns:
+            N x R x 3 x 4 for the R domains that follow no other one.
+
+        Raises:
+            ValueError: An array has another shape, or a number is not finite.
+            Error: The call failed.
+        """
+        states = StateTable(self._layout, q, transforms)
+        states.kinematics = await self._load_kinematics(self._time_limit(timeout))
+        matrices = states.batch(0, states.count, states.count)[1]
+        if matrices is None:
+            placements = rest_values(self._layout)[1][self._layout.roots].astype(np.float32)
+            matrices = np.tile(placements, (states.count, 1, 1, 1))
+        return matrices
+
     async def vertices(
         self,
         out: F32 | None = None,
@@ -764,6 +929,45 @@ class Scene:
             deadline_ms=deadline_ms(time_limit),
         )
         return await self._read_one(lambda: self._transport.stream(GET_VERTICES, request, time_limit), new_decoder)
+
+    async def _open_views(self, options: ViewOptions, timeout: float) -> Views:
+        views = Views(self._transport, self.name, self.info.up, self._layout, options, timeout=timeout)
+        await views.start()
+        return views
+
+    async def _states(
+        self,
+        q: ArrayLike | None,
+        transforms: ArrayLike | None,
+        cameras: ViewCameras | None,
+        size: ViewSize | None,
+        outputs: ViewOutputs,
+        joints: bool,
+        batch_size: int | None,
+        timeout: float | None,
+    ) -> tuple[StateTable, ViewOptions]:
+        """Checks the arguments of `render_states`. The options have one world for each state of a batch."""
+        options = view_options(1, cameras, None, size, outputs)
+        states = StateTable(self._layout, q, transforms)
+        if joints and states.count > 0:
+            states.kinematics = await self._load_kinematics(self._time_limit(timeout))
+        worlds = batch_size_of(states, options, self.client.info.limits.message_bytes, batch_size)
+        return states, replace(options, worlds=worlds)
+
+    async def _batches(
+        self, states: StateTable, options: ViewOptions, out: ViewArrays | None, timeout: float | None
+    ) -> ViewBatchStream:
+        time_limit = self._time_limit(timeout)
+        stream = ViewBatchStream(
+            self._transport,
+            lambda: self._open_views(options, time_limit),
+            states,
+            options,
+            out,
+            reconnect=self._reconnect,
+        )
+        await stream.start()
+        return stream
 
     async def _load_kinematics(self, timeout: float) -> Kinematics | None:
         """Reads the modes near the joints, once. None for a scene without attached domains."""

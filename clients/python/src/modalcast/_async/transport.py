@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar, cast
+from typing import Any, Generic, TypeAlias, TypeVar, cast
 
 import grpc
 import grpc.aio
@@ -13,13 +14,17 @@ from google.protobuf.message import Message
 
 from modalcast._channel import ConnectOptions, keep_memory_of_messages, options_of, route_to
 from modalcast._chunks import malformed
-from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
-from modalcast._step_progress import Progress
-from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rejection, from_rpc_error
+from modalcast._methods import DRAW_VIEWS, DRIVE_SCENE, GET_SERVER_INFO, Method
+from modalcast._shared_memory import MemoryConnection
+from modalcast._step_progress import Progress, StreamProgress
+from modalcast._view_progress import ViewProgress
+from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rpc_error
 from modalcast.v1 import steps_pb2
 
 RequestT = TypeVar("RequestT", bound=Message)
 ReplyT = TypeVar("ReplyT", bound=Message)
+StreamReplyT = TypeVar("StreamReplyT", steps_pb2.DriveSceneResponse, bytes)
+ProgressT = TypeVar("ProgressT", bound=StreamProgress)
 
 sleep = asyncio.sleep
 
@@ -53,36 +58,46 @@ class ReplyStream:
         self._call.cancel()
 
 
-class StepStream:
-    """A step stream. A task reads the replies, also while the caller does nothing."""
+class BidirectionalStream(Generic[StreamReplyT, ProgressT]):
+    """A call that sends steps and receives a reply to each. A task reads the replies, also while the caller waits."""
 
-    def __init__(self, call: grpc.aio.StreamStreamCall[Any, Any], address: str) -> None:
+    def __init__(
+        self,
+        call: grpc.aio.StreamStreamCall[Any, Any],
+        reply_type: type[StreamReplyT],
+        name: str,
+        address: str,
+        progress: ProgressT,
+    ) -> None:
+        """`name` is that of the stream in errors. `progress` receives all replies except the first one."""
         self._call = call
+        self._reply_type = reply_type
+        self._name = name
         self._address = address
         self._changed = asyncio.Event()
         self._reader: asyncio.Task[None] | None = None
-        self.progress = Progress()
+        self.progress = progress
 
-    async def open(self, request: steps_pb2.OpenDrive, timeout: float) -> steps_pb2.Opened:
-        """Sends the first message, and begins to read replies.
+    async def open(self, request: bytes, timeout: float) -> StreamReplyT:
+        """Sends the first message, returns the first reply, and begins to read the others.
 
         Raises:
             Error: The server rejects the request, or does not answer in time.
         """
         try:
             async with asyncio.timeout(timeout):
-                await self._call.write(steps_pb2.DriveSceneRequest(open=request).SerializeToString())
+                # If the call has ended already, `read` raises its status.
+                with contextlib.suppress(asyncio.InvalidStateError):
+                    await self._call.write(request)
                 reply = await self._call.read()
         except grpc.RpcError as error:
             raise from_rpc_error(error, self._address) from None
         except TimeoutError:
-            raise DeadlineExceeded(f"{self._address}: the drive did not open within {timeout:g} s") from None
-        if not isinstance(reply, steps_pb2.DriveSceneResponse):
-            raise malformed("drive.opened", "`opened` first", "the end of the stream")
-        if reply.HasField("rejection"):
-            raise from_rejection(reply.rejection)
+            raise DeadlineExceeded(f"{self._address}: the {self._name} did not open within {timeout:g} s") from None
+        if not isinstance(reply, self._reply_type):
+            raise malformed(f"{self._name}.opened", "`opened` first", "the end of the stream")
         self._reader = asyncio.create_task(self._read_replies())
-        return reply.opened
+        return reply
 
     async def send(self, request: bytes, timeout: float) -> None:
         """Sends an encoded step or a part of one. gRPC ends the stream if this is cancelled.
@@ -97,7 +112,7 @@ class StepStream:
             async with asyncio.timeout(timeout):
                 await self._call.write(request)
         except TimeoutError:
-            complaint = f"the server had no capacity for a step within {timeout:g} s, and the drive has ended"
+            complaint = f"the server had no capacity for a step within {timeout:g} s, and the {self._name} has ended"
             raise DeadlineExceeded(f"{self._address}: {complaint}") from None
         except (grpc.RpcError, asyncio.InvalidStateError):
             # The task that reads the replies receives the reason. `wait_until` raises it.
@@ -120,10 +135,10 @@ class StepStream:
                     self._changed.clear()
                     await self._changed.wait()
         except TimeoutError:
-            raise DeadlineExceeded(f"{self._address}: no acknowledgment of a step within {timeout:g} s") from None
+            raise DeadlineExceeded(f"{self._address}: no reply to a step within {timeout:g} s") from None
 
     async def finish(self, timeout: float) -> None:
-        """Ends the stream from this side, and waits until the server has released the scene."""
+        """Ends the stream from this side, and waits until the server has ended the call."""
         await self._call.done_writing()
         if self._reader is not None:
             await asyncio.wait([self._reader], timeout=timeout)
@@ -136,16 +151,23 @@ class StepStream:
             self._reader.cancel()
 
     async def _read_replies(self) -> None:
-        end: Error = ConnectionLost(f"{self._address}: the server has ended the step stream")
+        end: Error = ConnectionLost(f"{self._address}: the server has ended the {self._name}")
         try:
-            while isinstance(reply := await self._call.read(), steps_pb2.DriveSceneResponse):
-                self.progress.add(reply)
-                self._changed.set()
+            while isinstance(reply := await self._call.read(), self._reply_type):
+                if self.progress.add(reply):
+                    self._changed.set()
         except grpc.RpcError as error:
             end = from_rpc_error(error, self._address)
+        except Error as error:
+            end = error
+            self._call.cancel()
         finally:
             self.progress.end = end
             self._changed.set()
+
+
+StepStream: TypeAlias = BidirectionalStream[steps_pb2.DriveSceneResponse, Progress]
+ViewStream: TypeAlias = BidirectionalStream[bytes, ViewProgress]
 
 
 class Transport:
@@ -229,11 +251,25 @@ class Transport:
         return self._stream(self._subscriptions, method, request, None, wait_for_ready=wait_for_ready)
 
     def step_stream(self) -> StepStream:
-        """Makes a call that sends steps."""
+        """Makes a call that drives a scene."""
         method = DRIVE_SCENE
         # The requests are encoded already.
         call = cast(Any, self._channel.stream_stream(method.path, None, method.reply.FromString))
-        return StepStream(call(metadata=self._route.metadata), self.address)
+        return StepStream(call(metadata=self._route.metadata), method.reply, "drive", self.address, Progress())
+
+    def open_memory(self) -> MemoryConnection | None:
+        """Connects to the shared memory of a server on this machine; None if it offers none, or has none left."""
+        path = self._route.memory_socket
+        try:
+            return None if path is None else MemoryConnection(path)
+        except ConnectionLost:
+            return None
+
+    def view_stream(self, memory: MemoryConnection | None = None) -> ViewStream:
+        """Makes a call that draws views. `memory` receives their pictures."""
+        call = cast(Any, self._channel.stream_stream(DRAW_VIEWS.path))
+        metadata = (*self._route.metadata, *(() if memory is None else (memory.metadata,)))
+        return ViewStream(call(metadata=metadata), bytes, "view stream", self.address, ViewProgress(memory))
 
     async def close(self) -> None:
         """Closes the connections, and ends all calls."""

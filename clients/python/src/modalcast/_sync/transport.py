@@ -6,7 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
 import grpc
 from google.protobuf.message import Message
@@ -14,13 +14,17 @@ from grpc.experimental import ChannelOptions  # pyright: ignore[reportMissingTyp
 
 from modalcast._channel import ConnectOptions, keep_memory_of_messages, options_of, route_to
 from modalcast._chunks import malformed
-from modalcast._methods import DRIVE_SCENE, GET_SERVER_INFO, Method
-from modalcast._step_progress import Progress
-from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rejection, from_rpc_error
+from modalcast._methods import DRAW_VIEWS, DRIVE_SCENE, GET_SERVER_INFO, Method
+from modalcast._shared_memory import MemoryConnection
+from modalcast._step_progress import Progress, StreamProgress
+from modalcast._view_progress import ViewProgress
+from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rpc_error
 from modalcast.v1 import steps_pb2
 
 RequestT = TypeVar("RequestT", bound=Message)
 ReplyT = TypeVar("ReplyT", bound=Message)
+StreamReplyT = TypeVar("StreamReplyT", steps_pb2.DriveSceneResponse, bytes)
+ProgressT = TypeVar("ProgressT", bound=StreamProgress)
 
 sleep = time.sleep
 
@@ -107,37 +111,38 @@ class _RequestQueue:
             return request
 
 
-class StepStream:
-    """A step stream. A thread reads the replies, also while the caller does nothing."""
+class BidirectionalStream(Generic[StreamReplyT, ProgressT]):
+    """A call that sends steps and receives a reply to each. A thread reads the replies, also while the caller waits."""
 
     def __init__(
         self,
         call: Callable[[_RequestQueue], _Call],
+        name: str,
         address: str,
+        progress: ProgressT,
     ) -> None:
+        """`name` is that of the stream in errors. `progress` receives all replies except the first one."""
         self._requests = _RequestQueue()
+        self._name = name
         self._address = address
         self._changed = threading.Condition()
-        self._opened: steps_pb2.DriveSceneResponse | None = None
-        self.progress = Progress()
+        self._first_reply: StreamReplyT | None = None
+        self.progress = progress
         self._call = call(self._requests)
-        self._reader = threading.Thread(target=self._read_replies, name="modalcast drive", daemon=True)
+        self._reader = threading.Thread(target=self._read_replies, name=f"modalcast {name}", daemon=True)
         self._reader.start()
 
-    def open(self, request: steps_pb2.OpenDrive, timeout: float) -> steps_pb2.Opened:
-        """Sends the first message.
+    def open(self, request: bytes, timeout: float) -> StreamReplyT:
+        """Sends the first message, and returns the first reply.
 
         Raises:
             Error: The server rejects the request, or does not answer in time.
         """
-        self._requests.put(steps_pb2.DriveSceneRequest(open=request).SerializeToString(), timeout)
-        self._wait(lambda: self._opened is not None, timeout, "the drive did not open")
-        reply = self._opened or steps_pb2.DriveSceneResponse()
-        if reply.HasField("rejection"):
-            raise from_rejection(reply.rejection)
-        if not reply.HasField("opened"):
-            raise malformed("drive.opened", "`opened` first", "another message")
-        return reply.opened
+        self._requests.put(request, timeout)
+        self._wait(lambda: self._first_reply is not None, timeout, f"the {self._name} did not open")
+        if self._first_reply is None:
+            raise malformed(f"{self._name}.opened", "`opened` first", "the end of the stream")
+        return self._first_reply
 
     def send(self, request: bytes, timeout: float) -> None:
         """Sends an encoded step or a part of one.
@@ -160,10 +165,10 @@ class StepStream:
         """
         if self.progress.end is not None:
             raise self.progress.end.with_traceback(None)
-        self._wait(condition, timeout, "no acknowledgment of a step")
+        self._wait(condition, timeout, "no reply to a step")
 
     def finish(self, timeout: float) -> None:
-        """Ends the stream from this side, and waits until the server has released the scene."""
+        """Ends the stream from this side, and waits until the server has ended the call."""
         self._requests.close()
         self._reader.join(timeout)
         self.cancel()
@@ -184,22 +189,29 @@ class StepStream:
                 raise DeadlineExceeded(f"{self._address}: {complaint} within {timeout:g} s")
 
     def _read_replies(self) -> None:
-        end: Error = ConnectionLost(f"{self._address}: the server has ended the step stream")
+        end: Error = ConnectionLost(f"{self._address}: the server has ended the {self._name}")
         try:
             for reply in self._call:
                 with self._changed:
-                    if self._opened is None:
-                        self._opened = reply
-                    else:
-                        self.progress.add(reply)
-                    self._changed.notify_all()
+                    if self._first_reply is None:
+                        self._first_reply = reply
+                        self._changed.notify_all()
+                    elif self.progress.add(reply):
+                        self._changed.notify_all()
         except grpc.RpcError as error:
             end = from_rpc_error(error, self._address)
+        except Error as error:
+            end = error
+            self._call.cancel()
         finally:
             with self._changed:
                 self.progress.end = end
                 self._changed.notify_all()
             self._requests.close()
+
+
+StepStream: TypeAlias = BidirectionalStream[steps_pb2.DriveSceneResponse, Progress]
+ViewStream: TypeAlias = BidirectionalStream[bytes, ViewProgress]
 
 
 class Transport:
@@ -281,12 +293,27 @@ class Transport:
         return self._stream(self._subscriptions, method, request, None, wait_for_ready=wait_for_ready)
 
     def step_stream(self) -> StepStream:
-        """Makes a call that sends steps."""
+        """Makes a call that drives a scene."""
         method = DRIVE_SCENE
         # The requests are encoded already.
         call = cast(Any, self._channel.stream_stream(method.path, None, method.reply.FromString))
         metadata = self._route.metadata
-        return StepStream(lambda requests: call(requests, metadata=metadata), self.address)
+        return StepStream(lambda requests: call(requests, metadata=metadata), "drive", self.address, Progress())
+
+    def open_memory(self) -> MemoryConnection | None:
+        """Connects to the shared memory of a server on this machine; None if it offers none, or has none left."""
+        path = self._route.memory_socket
+        try:
+            return None if path is None else MemoryConnection(path)
+        except ConnectionLost:
+            return None
+
+    def view_stream(self, memory: MemoryConnection | None = None) -> ViewStream:
+        """Makes a call that draws views. `memory` receives their pictures."""
+        call = cast(Any, self._channel.stream_stream(DRAW_VIEWS.path))
+        metadata = (*self._route.metadata, *(() if memory is None else (memory.metadata,)))
+        progress = ViewProgress(memory)
+        return ViewStream(lambda requests: call(requests, metadata=metadata), "view stream", self.address, progress)
 
     def close(self) -> None:
         """Closes the connections, and ends all calls."""
