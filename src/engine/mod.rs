@@ -16,7 +16,7 @@
 //! | call of the reader | waits for the pictures, lets them be encoded, and sends them | `output::frame_queue` |
 //!
 //! Vertices and picks take the same path without the encoder threads. Batches of small views have a path of their own
-//! ([`views`]): copies of a scene that one caller moves, without a task.
+//! (`views`): copies of a scene that one caller moves, without a task.
 
 mod blocking;
 mod catch_unwind;

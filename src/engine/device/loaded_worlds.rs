@@ -48,7 +48,7 @@ pub struct ExportedSlots {
     pub device: [u8; 16],
 }
 
-/// The pictures of a [`ViewRequest`]. [`modalcast_model::views::ViewOutputs`] has the shapes of the arrays.
+/// The pictures of some views of a step. [`modalcast_model::views::ViewOutputs`] has the shapes of the arrays.
 #[derive(Debug)]
 pub struct DrawnViews {
     /// An array for each output that was requested. Empty if the pictures are in exported memory.
