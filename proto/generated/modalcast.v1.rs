@@ -5838,7 +5838,7 @@ pub mod draw_views_request {
 pub struct OpenViews {
     #[prost(string, tag = "1")]
     pub scene: ::prost::alloc::string::String,
-    /// Number of worlds, 1 to 65536; 0 means 1.
+    /// Number of worlds, 1 to 65536, with at most 1048576 domains in all; 0 means 1.
     #[prost(uint32, tag = "2")]
     pub worlds: u32,
     /// Size of a view in pixels, 1 to 1024 on each side; 0 x 0 means 64 x 64.
@@ -5922,7 +5922,8 @@ pub struct ViewsOpened {
     pub device_slots: ::core::option::Option<DeviceSlots>,
 }
 /// Memory of the GPU that the client imports, so that it reads the pictures without a copy. A slot has the arrays of one
-/// step. Its allocation is one of cuMemCreate, whose POSIX file descriptor arrives on the socket of the shared memory.
+/// step; the places of views that a step does not draw (ViewStep.drawn_worlds) keep their pictures. Its allocation is one
+/// of cuMemCreate, whose POSIX file descriptor arrives on the socket of the shared memory.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeviceSlots {
     /// UUID of the device, 16 bytes.
@@ -6073,7 +6074,7 @@ pub mod view_service_client {
         ///
         /// The first request opens the worlds, and the first reply confirms that. Each further request is a step, after which
         /// all views are drawn again. The replies to a step are the pictures in chunks, or one rejection; they precede those of
-        /// the next step. A client may send steps ahead. Until it reads the replies, the server stops to read requests. The call
+        /// the next step. A client may send steps ahead. While replies are unread, the server reads no requests. The call
         /// ends when the client has closed its side and all replies are sent.
         ///
         /// A view has one sample per pixel, and no shadows, ambient occlusion or antialiasing; otherwise it is the picture that
@@ -6129,7 +6130,7 @@ pub mod view_service_server {
         ///
         /// The first request opens the worlds, and the first reply confirms that. Each further request is a step, after which
         /// all views are drawn again. The replies to a step are the pictures in chunks, or one rejection; they precede those of
-        /// the next step. A client may send steps ahead. Until it reads the replies, the server stops to read requests. The call
+        /// the next step. A client may send steps ahead. While replies are unread, the server reads no requests. The call
         /// ends when the client has closed its side and all replies are sent.
         ///
         /// A view has one sample per pixel, and no shadows, ambient occlusion or antialiasing; otherwise it is the picture that
@@ -6463,8 +6464,8 @@ pub struct Limits {
     /// Deadline in milliseconds of a request that sets none.
     #[prost(uint32, tag = "6")]
     pub deadline_ms: u32,
-    /// Number of DriveScene streams that one connection may have open. The HTTP/2 layer closes a connection that buffers
-    /// too many small frames; a blocked stream of the smallest steps uses up to a fifth of this budget.
+    /// Number of DriveScene and DrawViews streams that one connection may have open. The HTTP/2 layer closes a connection
+    /// that buffers too many small frames; a blocked stream of the smallest steps uses up to a fifth of this budget.
     #[prost(uint32, tag = "7")]
     pub drives: u32,
     /// Limit in bytes on the messages that one client is sending. A message counts with its whole length from its

@@ -131,6 +131,15 @@ impl Limit {
         when_full: WhenFull::Refuse { minimum: 1 },
     };
 
+    pub const VIEW_CALLS: &'static Self = &Self {
+        resource: "view_calls",
+        objects: "calls that draw batches of small views",
+        option: None,
+        total: |_| 64,
+        reserve_divisor: 8,
+        when_full: WhenFull::Refuse { minimum: 1 },
+    };
+
     /// They count to the principal, whichever client it uploads with.
     pub const STORED_BYTES: &'static Self = &Self {
         resource: "stored_bytes",
@@ -143,7 +152,7 @@ impl Limit {
 }
 
 /// All resources.
-pub const LIMITS: [&Limit; 11] = [
+pub const LIMITS: [&Limit; 12] = [
     Limit::CONNECTIONS,
     Limit::SUBSCRIPTIONS,
     Limit::WAITING_REQUESTS,
@@ -154,6 +163,7 @@ pub const LIMITS: [&Limit; 11] = [
     Limit::LOADS,
     Limit::BUILT_IN_LOADS,
     Limit::SHARED_MEMORY,
+    Limit::VIEW_CALLS,
     Limit::STORED_BYTES,
 ];
 

@@ -108,7 +108,7 @@ use self::storage::scene_catalog::SceneCatalog;
 use self::storage::scene_record::SceneRecord;
 use self::storage::upload_record::find_uploaded_files;
 use self::upload_permits::{UploadPermit, UploadPermits};
-use crate::admission::{Account, Admission, Client, Limit, Queue};
+use crate::admission::{Account, Admission, Client, Limit, PermitPool, Queue};
 use crate::config::{Config, ValidatedConfig};
 use crate::identity::Principal;
 use modalcast_model::error::{Error, Result, invalid};
@@ -132,6 +132,7 @@ struct Shared {
     loads: Queue,
     built_in_loads: Queue,
     upload_permits: Arc<UploadPermits>,
+    view_calls: PermitPool,
     /// Whether every scene of the last run is open or has failed.
     are_scenes_reopened: watch::Sender<bool>,
     next_scene_id: AtomicU64,
@@ -198,6 +199,7 @@ impl Engine {
         for upload in stored_uploads {
             upload_permits.store(&upload.scene, Some(upload.owner.into()), upload.bytes);
         }
+        let view_calls = admission.pool(Limit::VIEW_CALLS, (Limit::VIEW_CALLS.total)(&config));
         let [loads, built_in_loads] = [Limit::LOADS, Limit::BUILT_IN_LOADS].map(|limit| Queue::new(limit, &config));
         let shared = Shared {
             services: SceneServices {
@@ -218,6 +220,7 @@ impl Engine {
             loads,
             built_in_loads,
             upload_permits,
+            view_calls,
             are_scenes_reopened: watch::Sender::new(false),
             next_scene_id: AtomicU64::new(1),
             is_stopping: AtomicBool::new(false),

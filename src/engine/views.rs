@@ -20,16 +20,17 @@ use super::device::loaded_scene::uniform_origin;
 use super::device::loaded_worlds::{DrawnViews, ExportedSlots, RingPlace, ViewRequest};
 use super::scene::handle::SceneHandle;
 use super::scene_memory::SceneMemory;
-use crate::admission::Account;
-use modalcast_model::error::{Result, invalid};
+use crate::admission::{Account, Permit};
+use crate::telemetry::Stage;
+use modalcast_model::error::{Result, fault_in, invalid};
 use modalcast_model::scene::{BoundingBox, Camera, RawStepUpdate, Scene, SceneState, StepUpdate};
 use modalcast_model::views::{ViewCamera, ViewFormat};
 use modalcast_render::FrameParams;
 use modalcast_render::view_data::{view_camera, view_scene};
 
-/// Bytes of a step, and number of its new cameras, up to which the calling thread prepares it itself.
-const INLINE_STEP_BYTES: usize = 128 << 10;
-const INLINE_CAMERAS: usize = 64;
+/// Bytes of a step and of the state, and number of cameras, up to which the calling thread prepares a step itself.
+const INLINE_STEP_BYTES: usize = 1 << 20;
+const INLINE_CAMERAS: usize = 1024;
 
 /// Largest number of slots of exported device memory of a session.
 const MAX_DEVICE_SLOTS: usize = 16;
@@ -87,17 +88,17 @@ pub struct ViewStep {
 struct WorldsOnDevice {
     device: DeviceHandle,
     id: SceneId,
-    /// Reserved until the device has unloaded the worlds.
-    memory: Option<SceneMemory>,
+    /// Held until the device has unloaded the worlds.
+    resources: Option<(SceneMemory, Permit)>,
 }
 
 impl Drop for WorldsOnDevice {
     fn drop(&mut self) {
-        let (device, id, memory) = (self.device.clone(), self.id, self.memory.take());
+        let (device, id, resources) = (self.device.clone(), self.id, self.resources.take());
         let unload = async move {
             // Fails only if the device thread has ended, which frees the worlds, too.
             device.unload_scene(id).await.ok();
-            drop(memory);
+            drop(resources);
         };
         // Without a runtime, the process ends.
         if let Ok(runtime) = tokio::runtime::Handle::try_current() {
@@ -107,11 +108,12 @@ impl Drop for WorldsOnDevice {
 }
 
 impl Engine {
-    /// Loads worlds for an account. Waits until the account may load a scene.
+    /// Loads worlds for an account. Waits until the account may load a scene. The work runs in a separate task, so that
+    /// what it has reserved remains reserved until it ends, also if the caller is cancelled.
     ///
     /// # Errors
-    /// `Invalid` for settings out of range, and for a scene with features that views do not have; `OutOfMemory` before
-    /// memory is taken; `Fault` of the device.
+    /// `Invalid` for settings out of range, and for a scene with features that views do not have; `LimitReached`;
+    /// `OutOfMemory` before memory is taken; `Fault` of the device.
     pub async fn open_views(
         &self,
         scene_handle: &SceneHandle,
@@ -119,28 +121,40 @@ impl Engine {
         settings: ViewSettings,
     ) -> Result<ViewSession> {
         settings.check()?;
-        let (scene, name) = (Arc::clone(&scene_handle.scene), &scene_handle.name);
+        let permit = self.shared.view_calls.acquire(account)?;
+        let (scene, name) = (Arc::clone(&scene_handle.scene), scene_handle.name.clone());
+        let (engine, account) = (self.clone(), account.clone());
+        let load = async move { engine.load_views(&name, scene, &account, settings, permit).await };
+        tokio::spawn(load).await.map_err(fault_in("views"))?
+    }
+
+    async fn load_views(
+        &self,
+        name: &str,
+        scene: Arc<Scene>,
+        account: &Account,
+        settings: ViewSettings,
+        permit: Permit,
+    ) -> Result<ViewSession> {
         let memory = self.shared.memory.new_scene(account.principal.as_deref().unwrap_or_default());
         memory.reserve_worlds(name, &scene, settings.worlds, settings.piece_bytes())?;
         let turn = self.shared.loads.member(account).acquire(1).await?;
-        let (world, world_count) = (Arc::clone(&scene), settings.worlds);
-        let build = move || Ok((view_scene(&world)?, world.worlds(world_count)?));
-        let (static_data, all) = run_blocking("worlds", build).await?;
-        let state = Arc::new(SceneState::rest(&all));
-        let cameras = Arc::clone(&settings.cameras);
-        let view_cameras = view_cameras(&scene, &settings.format, &cameras, [0.0; 3])?;
+        let build = move || {
+            let (static_data, all) = (view_scene(&scene)?, scene.worlds(settings.worlds)?);
+            let (state, cameras) = (Arc::new(SceneState::rest(&all)), Arc::clone(&settings.cameras));
+            let view_cameras = view_cameras(&scene, &settings.format, &cameras, [0.0; 3])?;
+            let shown = Shown { state, cameras, origin: [0.0; 3], view_cameras };
+            Ok((static_data, shown, Worlds { scene, all, settings }))
+        };
+        let (static_data, shown, worlds) = run_blocking("worlds", build).await?;
+        // Without a name: the crash log must not set the scene aside because of what one caller does to its copies.
         let id = self.shared.next_scene_id.fetch_add(1, Ordering::Relaxed);
         let device = self.shared.services.device.clone();
-        device.name_scene(id, name);
-        let on_device = WorldsOnDevice { device, id, memory: Some(memory) };
-        on_device.device.load_worlds(id, &all, scene.domains.len(), static_data).await?;
+        let on_device = WorldsOnDevice { device, id, resources: Some((memory, permit)) };
+        on_device.device.load_worlds(id, &worlds.all, worlds.scene.domains.len(), static_data).await?;
         drop(turn);
-        Ok(ViewSession {
-            piece_size: PieceSize::new(settings.max_piece_views()),
-            shared: Arc::new(Worlds { scene, all, settings }),
-            shown: Shown { state, cameras, origin: [0.0; 3], view_cameras },
-            on_device,
-        })
+        let piece_size = PieceSize::new(worlds.settings.max_piece_views());
+        Ok(ViewSession { piece_size, shared: Arc::new(worlds), shown, on_device })
     }
 }
 
@@ -160,8 +174,10 @@ impl ViewSession {
     /// `Invalid` with the field.
     pub async fn prepare(&self, update: ViewUpdate) -> Result<ViewStep> {
         let (shared, shown) = (Arc::clone(&self.shared), self.shown.clone());
-        let is_small = update.step.q.len() + update.step.transforms.len() <= INLINE_STEP_BYTES
-            && update.cameras.len() <= INLINE_CAMERAS;
+        // The state is copied, and all cameras may have to be converted.
+        let state_bytes = size_of_val(&shown.state.q[..]) + size_of_val(&shown.state.transforms[..]);
+        let is_small = update.step.q.len() + update.step.transforms.len() + state_bytes <= INLINE_STEP_BYTES
+            && shown.cameras.len() <= INLINE_CAMERAS;
         match is_small {
             true => shared.step(shown, update),
             false => run_blocking("views", move || shared.step(shown, update)).await,
@@ -198,9 +214,10 @@ impl ViewSession {
         self.shown = step.shown.clone();
     }
 
-    /// Adapts the number of views that are drawn without a break to the time of such a piece.
+    /// Adapts the number of views that are drawn without a break to the time of drawing such a piece.
     pub fn record_piece(&mut self, count: usize, drawn: &DrawnViews) {
-        self.piece_size.record(count, drawn.stages.iter().map(|(_, ms)| ms).sum());
+        let times = drawn.stages.iter().filter(|(stage, _)| *stage == Stage::Draw);
+        self.piece_size.record(count, times.map(|(_, ms)| ms).sum());
     }
 }
 
@@ -213,9 +230,9 @@ impl ViewSession {
         if !(1..=MAX_DEVICE_SLOTS).contains(&slot_count) {
             return Err(invalid("device_slots", format!("1 to {MAX_DEVICE_SLOTS}"), slot_count));
         }
-        let WorldsOnDevice { device, id, memory } = &self.on_device;
+        let WorldsOnDevice { device, id, resources } = &self.on_device;
         let settings = &self.shared.settings;
-        if let Some(memory) = memory {
+        if let Some((memory, _)) = resources {
             let bytes = settings.views() as u64 * settings.view_bytes() as u64 * slot_count as u64;
             memory.reserve_pictures(&format!("{slot_count} slots of {} views", settings.views()), bytes)?;
         }
@@ -227,15 +244,6 @@ impl ViewStep {
     /// Draws the pictures into a slot of exported device memory.
     pub const fn draw_into(&mut self, slot: usize) {
         self.slot = Some(slot);
-    }
-
-    /// Number of views of the step.
-    pub const fn views(&self) -> usize {
-        self.views
-    }
-
-    pub const fn is_started(&self) -> bool {
-        self.started == self.views
     }
 }
 

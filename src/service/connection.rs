@@ -126,7 +126,7 @@ impl ConnectionInfo {
     /// # Errors
     /// `LimitReached` when the connection has [`MAX_DRIVES`] step streams.
     pub(super) fn acquire_drive(&self) -> Result<OwnedSemaphorePermit> {
-        let too_many = |_| Error::LimitReached { objects: "step streams of one connection", limit: MAX_DRIVES };
+        let too_many = |_| Error::LimitReached { objects: "streams of steps of one connection", limit: MAX_DRIVES };
         Arc::clone(&self.drive_permits).try_acquire_owned().map_err(too_many)
     }
 

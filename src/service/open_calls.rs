@@ -25,8 +25,8 @@ pub(super) struct CountedCall {
 /// The messages of a method that are progress of its connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum ProgressSign {
-    /// None that every call has: health and reflection are not work, and a step stream can consist of rejections.
-    /// [`super::steps`] records the steps that are completed.
+    /// None that every call has: health and reflection are not work, and a stream of steps can consist of rejections.
+    /// [`super::steps`] and [`super::views`] record the steps that are completed.
     None,
     /// Those of the client.
     Requests,
@@ -38,7 +38,7 @@ impl ProgressSign {
     /// `path` is the path of the method's URL.
     fn of_method(path: &str) -> Self {
         match path {
-            "/modalcast.v1.StepService/DriveScene" => Self::None,
+            "/modalcast.v1.StepService/DriveScene" | "/modalcast.v1.ViewService/DrawViews" => Self::None,
             "/modalcast.v1.SceneService/UploadScene" | "/modalcast.v1.SceneService/UploadArrays" => Self::Requests,
             _ if path.starts_with("/grpc.") => Self::None,
             _ => Self::Replies,

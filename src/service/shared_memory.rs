@@ -122,6 +122,11 @@ impl ConnectionMemory {
 }
 
 impl CallMemory {
+    /// Whether the call has shared memory.
+    pub(super) const fn is_available(&self) -> bool {
+        self.0.is_some()
+    }
+
     /// Moves the data of a chunk to shared memory if the call uses it. Waits for a free slot. Returns `None` and keeps
     /// the data if the chunk must contain them. Cancel-safe.
     pub(super) async fn share(&self, data: &mut Bytes) -> Option<v1::SharedRange> {

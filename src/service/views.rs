@@ -6,7 +6,7 @@ use std::sync::Arc;
 use modalcast_proto::v1;
 use modalcast_proto::v1::draw_views_request::Kind as RequestKind;
 use modalcast_proto::v1::draw_views_response::Part;
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, mpsc};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::caller::Caller;
@@ -18,9 +18,10 @@ use super::shared_memory::{CallMemory, DeviceMemory, SharedMemory};
 use super::status::{to_rejection, to_status, transport_status};
 use super::step_parts::StepAssembler;
 use super::stream::{Deadline, ReplySender, ReplyStream, respond, run_while_permitted, split_into_chunks};
+use crate::admission::PermitHandle;
 use crate::engine::{DrawnViews, Engine, PendingViews, SceneRight, ViewSession, ViewStep};
 use crate::telemetry::StageTimes;
-use modalcast_model::error::{Error, Result, fault};
+use modalcast_model::error::{Error, Result, fault, invalid};
 
 /// Implementation of `ViewService`.
 pub(super) struct ViewServiceImpl {
@@ -39,14 +40,18 @@ impl v1::view_service_server::ViewService for ViewServiceImpl {
         let deadline = Deadline::of_stream(request.metadata());
         let caller = Caller::of(&request)?;
         let connection = ConnectionInfo::of(&request).map_err(to_status)?;
+        // Views count as step streams, because HTTP/2 buffers their small steps in the same way.
+        let drive_permit = connection.acquire_drive().map_err(to_status)?;
         let memory = self.shared_memory.find(request.metadata(), &caller.principal).map_err(to_status)?;
         let replies = Arc::clone(&caller.replies);
         let call = ViewCall {
             parts: StepAssembler::new(connection.receive.new_memory(), connection.receive.limits(), memory.clone()),
             engine: self.engine.clone(),
+            connection: connection.permit.clone(),
             caller,
             inbound: request.into_inner(),
             memory,
+            _drive_permit: drive_permit,
         };
         Ok(respond(replies, move |reply_sender| deadline.enforce("the views", call.run(reply_sender))))
     }
@@ -60,6 +65,9 @@ struct ViewCall {
     /// The step that is being received, if it has several parts.
     parts: StepAssembler,
     memory: CallMemory,
+    /// The permit of the connection.
+    connection: PermitHandle,
+    _drive_permit: OwnedSemaphorePermit,
 }
 
 impl ViewCall {
@@ -78,6 +86,10 @@ impl ViewCall {
         let principal = &self.caller.principal;
         let scene_handle = self.engine.find_opened(&open.scene, principal, SceneRight::Use).await.map_err(to_status)?;
         let slot_count = open.device_slots as usize;
+        if slot_count > 0 && !self.memory.is_available() {
+            let error = invalid("device_slots", "a call with shared memory", "a call without it");
+            return Err(to_status(error));
+        }
         let settings = parse_view_settings(&scene_handle.scene, open).map_err(to_status)?;
         let session = self.engine.open_views(&scene_handle, &self.caller.account, settings).await.map_err(to_status)?;
         let (right_ended, closed) = (scene_handle.right_ended(principal, SceneRight::Use), scene_handle.closed());
@@ -100,7 +112,7 @@ impl ViewCall {
         let (replies, receiver) = mpsc::channel(1);
         let max_chunk_bytes = self.engine.config().chunk_bytes;
         let work = async {
-            let send = send_replies(receiver, self.memory, max_chunk_bytes, &reply_sender);
+            let send = send_replies(receiver, self.memory, max_chunk_bytes, &self.connection, &reply_sender);
             tokio::try_join!(stream.run(replies), send).map(|((), ())| ())
         };
         run_while_permitted(scene_ended, work).await
@@ -207,11 +219,15 @@ async fn send_replies(
     mut replies: mpsc::Receiver<Reply>,
     memory: CallMemory,
     max_chunk_bytes: usize,
+    connection: &PermitHandle,
     reply_sender: &ReplySender<v1::DrawViewsResponse>,
 ) -> Result<(), Status> {
     while let Some(reply) = replies.recv().await {
         match reply {
-            Reply::Rejection(rejection) => reply_sender.send(to_response(Part::Rejection(rejection))).await?,
+            Reply::Rejection(rejection) => {
+                reply_sender.send(to_response(Part::Rejection(rejection))).await?;
+                continue;
+            }
             Reply::Device(views) => reply_sender.send(to_response(Part::Device(views))).await?,
             Reply::Views { step, first, count, drawn } => {
                 for mut chunk in view_chunks(step, first, count, &drawn, max_chunk_bytes) {
@@ -220,6 +236,7 @@ async fn send_replies(
                 }
             }
         }
+        connection.mark_progress();
     }
     Ok(())
 }

@@ -6,7 +6,7 @@ use modalcast_model::error::{Result, invalid};
 use modalcast_model::scene::Camera;
 use modalcast_model::views::{MAX_VIEW_SIDE, MAX_VIEWS, View, ViewFormat, ViewOutputs};
 
-/// Bytes of the pictures that are drawn without a break. Two such pieces are in memory while a client reads.
+/// Bytes of the pictures that are drawn without a break. Three such pieces are in memory while a client reads.
 const PIECE_BYTES: usize = 8 << 20;
 
 /// Which worlds a camera sees.

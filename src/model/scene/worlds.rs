@@ -8,7 +8,7 @@ use crate::error::{Result, invalid};
 
 impl Scene {
     /// One scene that consists of `count` worlds. Domain d of world w has the index w D + d in a scene of D domains, and
-    /// vertices, corners, coordinates and transforms of the worlds follow one another. Meshes and U exist once. What
+    /// vertices, corners, coordinates and transforms of the worlds follow one another. All worlds share the shapes. What
     /// only clients need is missing: attachments and metadata. So are shadows, because worlds would cast them on each
     /// other.
     ///

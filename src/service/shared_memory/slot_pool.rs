@@ -7,7 +7,7 @@ use tokio::sync::Semaphore;
 
 use crate::engine::lock;
 
-/// Which slots are free, and which are lent. A slot that was taken and is not lent yet is neither.
+/// Which slots are free, and which are lent to the client. In between, a slot is taken: the server writes it.
 #[derive(Debug)]
 pub(in crate::service) struct SlotPool {
     slots: Mutex<Slots>,

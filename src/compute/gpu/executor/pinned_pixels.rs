@@ -53,7 +53,7 @@ impl AsRef<[u8]> for PinnedArray {
     }
 }
 
-/// Pinned memory of arrays, which is used again.
+/// A pool of pinned host buffers. A buffer is free when no reader has it.
 #[derive(Debug, Default)]
 pub struct PinnedPool {
     buffers: Vec<Arc<PinnedPixels>>,
@@ -80,10 +80,10 @@ impl PinnedPool {
         let is_free = |buffer: &Arc<PinnedPixels>| Arc::strong_count(buffer) == 1;
         let found = self.buffers.iter().position(|buffer| is_free(buffer) && buffer.bytes >= bytes);
         let taken = found.map(|index| self.buffers.swap_remove(index));
-        let mut kept = 0;
+        let mut free_count = 0;
         self.buffers.retain(|buffer| {
-            kept += usize::from(is_free(buffer));
-            !is_free(buffer) || kept <= MAX_FREE
+            free_count += usize::from(is_free(buffer));
+            !is_free(buffer) || free_count <= MAX_FREE
         });
         match taken {
             Some(buffer) => Ok(buffer),

@@ -4,6 +4,9 @@
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 
+use cudarc::driver::sys;
+
+use crate::gpu::launch::error::cuda_error;
 use crate::gpu::launch::{Device, ExportedMemory};
 use modalcast_model::error::{Result, invalid};
 use modalcast_model::views::ViewFormat;
@@ -45,7 +48,7 @@ impl ViewArrayLayout {
     }
 }
 
-/// Slots of exported device memory. Dropping it waits for the work on the device's stream, which may write to a slot.
+/// Slots of exported device memory, which contain zeros before the first pictures. Dropping it waits for the work on the device's stream, which may write to a slot.
 #[derive(Debug)]
 pub struct ViewRing {
     device: Arc<Device>,
@@ -71,7 +74,17 @@ impl ViewRing {
         let layout = ViewArrayLayout::new(format, views);
         let allocate = |_| ExportedMemory::new(device, layout.slot_bytes as usize);
         let slots = (0..slot_count).map(allocate).collect::<Result<_>>()?;
-        Ok(Self { device: Arc::clone(device), slots, layout, views })
+        let ring = Self { device: Arc::clone(device), slots, layout, views };
+        // New memory may contain data of others.
+        let (_current, stream) = (device.enter()?, device.stream());
+        for slot in &ring.slots {
+            // SAFETY: the memory has these bytes, and the ring waits for the stream before it releases them.
+            unsafe { sys::cuMemsetD8Async(slot.address(), 0, slot.bytes(), stream.cu_stream()) }
+                .result()
+                .map_err(cuda_error("allocate"))?;
+        }
+        device.synchronize("allocate")?;
+        Ok(ring)
     }
 
     /// A file descriptor of each slot, and the bytes of its allocation.

@@ -8,6 +8,7 @@
 mod tests;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::{Pod, Zeroable};
 use cudarc::driver::{CudaFunction, CudaStream, LaunchConfig};
@@ -109,7 +110,7 @@ struct TriangleChunk {
 
 /// Draws batches of views of one scene.
 ///
-/// Dropping it waits for the work on the device's stream, because its static data belong to another stream.
+/// Its static data belong to another stream than its work. So if it has drawn, dropping it waits for that work.
 #[derive(Debug)]
 pub struct CudaViewRenderer {
     device: Arc<Device>,
@@ -118,6 +119,8 @@ pub struct CudaViewRenderer {
     tables: SceneTables,
     /// The textures that the material table refers to.
     _images: Vec<MipmappedTexture>,
+    /// Whether a kernel may use the static data. Without one, another thread than that of the device may drop this.
+    has_drawn: AtomicBool,
 }
 
 /// The static data of a scene on the device.
@@ -312,7 +315,14 @@ impl CudaViewRenderer {
         let images = scene.images.iter().map(upload_image).collect::<Result<Vec<_>>>()?;
         let tables = SceneTables::new(&upload_device, scene, &images)?;
         upload_device.synchronize("upload")?;
-        Ok(Self { device: Arc::clone(device), views, bound_chunks, tables, _images: images })
+        Ok(Self {
+            device: Arc::clone(device),
+            views,
+            bound_chunks,
+            tables,
+            _images: images,
+            has_drawn: AtomicBool::new(false),
+        })
     }
 
     /// The device that draws.
@@ -393,6 +403,7 @@ impl CudaViewRenderer {
         if !is_own(vertices.stream) || !is_own(views.views.stream()) || views.chunk_count != tables.chunk_count {
             return Err(fault("views", "expected vertices and a batch of this renderer"));
         }
+        self.has_drawn.store(true, Ordering::Relaxed);
         let args = self.args(vertices, views);
         if views.boxes.is_some() {
             let chunks = views.world_count * tables.chunk_count;
@@ -404,7 +415,7 @@ impl CudaViewRenderer {
         // verified those of the views, and the loop above the sizes of the vertices. `prepare_arrays` got outputs for
         // these views, aligned to 4 bytes, and allocated boxes for this number of chunks. All memory exists until the
         // kernels have ended: that of `views` is released in the order of the stream, a ring and `self` wait for the
-        // stream before they are released, and `DeviceVertices` promises one of both.
+        // stream before they are released, and `DeviceVertices` guarantees that the stream orders the release or waits.
         unsafe { self.start(&self.views, views.view_count * args.tiles_per_view, shared_bytes, &args) }
     }
 
@@ -467,8 +478,10 @@ impl CudaViewRenderer {
 
 impl Drop for CudaViewRenderer {
     fn drop(&mut self) {
-        // After a fault the call fails, but then no kernel runs.
-        self.device.stream().synchronize().ok();
+        if *self.has_drawn.get_mut() {
+            // After a fault the call fails, but then no kernel runs.
+            self.device.stream().synchronize().ok();
+        }
     }
 }
 
