@@ -14,7 +14,7 @@ from scenes import RANK, beam
 import modalcast as mc
 
 WORLDS = 37
-OUTPUTS = ("color", "depth", "domains", "normals")
+OUTPUTS = ("normals", "depth", "color", "domains")
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -67,3 +68,34 @@ def test_rerun_recording_has_the_vertices_of_each_step(client: mc.Client, tmp_pa
     rows = re.findall(r"with (\d+) rows .* - /scene/tree - data columns: .*vertex_normals.*vertex_positions", output)
     assert sum(map(int, rows)) == 8
     client.open("tree").reset()
+
+
+def test_beams_reach_their_targets_and_a_mask_resets_some_worlds(client: mc.Client):
+    spec = importlib.util.spec_from_file_location("reach", EXAMPLES / "reach.py")
+    assert spec is not None
+    assert spec.loader is not None
+    reach = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(reach)
+    env = reach.BeamReach(client, 16)
+    pixels, info = env.reset(seed=3)
+    assert pixels in env.observation_space
+    assert len(np.unique(pixels.reshape(16, -1), axis=0)) == 16, "expected a target of its own in each world"
+    start = info["distance"]
+    _, reward, terminated, truncated, _ = env.step(np.zeros((16, reach.MODES)))
+    np.testing.assert_allclose(-reward, start)
+    for _ in range(reach.EPISODE - 1):
+        assert not truncated.any()
+        # Moves the tip straight to the target.
+        tips = env._tip + env._q @ env._tip_modes.T
+        error = env._transforms[:, 1, :, 3] - tips
+        pixels, reward, terminated, truncated, info = env.step(error @ np.linalg.pinv(env._tip_modes).T / reach.STEP)
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["distance"].mean() < 0.2 * start.mean(), "the actions do not move the tip to the target"
+    mask = np.arange(16) % 2 == 0
+    after, info = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], pixels[~mask])
+    assert (after[mask] != pixels[mask]).any(axis=(1, 2, 3)).all()
+    assert (info["distance"][mask] > 0.05).all()
+    env.close()
+    client.delete("reach")

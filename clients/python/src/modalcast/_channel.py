@@ -132,13 +132,13 @@ def route_to(address: str, options: ConnectOptions) -> Route:
     for name, value in metadata:
         if not (_is_text(name) and name == name.lower() and value.isascii() and value.isprintable()):
             raise ValueError(f"metadata: expected lower-case names and values of visible ASCII letters, got '{name}'")
-    memory_socket = _local_socket(target, "memory.sock")
+    memory_socket = _local_socket(target, "memory.sock", probe=False)
     token = options.token
     path = os.environ.get("MODALCAST_TOKEN_FILE")
     if token is None and path and not target.startswith("unix:"):
         token = Path(path).read_text().strip()
     if token is None:
-        socket_path = None if credentials else _local_socket(target, "sock")
+        socket_path = None if credentials else _local_socket(target, "sock", probe=True)
         path = target if socket_path is None else f"unix:{socket_path}"
         return Route(path, metadata, credentials, memory_socket)
     if not _is_text(token):
@@ -168,10 +168,10 @@ def _credentials(address: str, options: ConnectOptions) -> grpc.ChannelCredentia
     return grpc.ssl_channel_credentials(*contents)
 
 
-def _local_socket(target: str, extension: str) -> Path | None:
+def _local_socket(target: str, extension: str, *, probe: bool) -> Path | None:
     """A socket of a running server of this user at HOST:PORT: "sock" for calls, "memory.sock" for shared memory.
 
-    Others cannot create one in a folder of this user.
+    Others cannot create one in a folder of this user. With `probe`, only a socket that is answered.
     """
     host, _, port = target.rpartition(":")
     if host not in ("localhost", "[::1]") and not host.startswith("127."):
@@ -186,7 +186,7 @@ def _local_socket(target: str, extension: str) -> Path | None:
         return None
     is_private = stat.S_ISDIR(of_folder.st_mode) and of_folder.st_mode & 0o022 == 0
     is_own = is_private and of_folder.st_uid == of_socket.st_uid and stat.S_ISSOCK(of_socket.st_mode)
-    return path if is_own and _is_answered(path) else None
+    return path if is_own and (not probe or _is_answered(path)) else None
 
 
 def _is_answered(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 from collections import deque
@@ -46,7 +47,7 @@ class DeviceSlots:
         Args:
             connection: The connection of the call.
             opened: What the server tells about the slots.
-            shapes: The shape of each array by output, in the order of the offsets.
+            shapes: The shape of each array by output, in the order of the server's outputs.
             dtypes: The types of the arrays.
 
         Raises:
@@ -92,7 +93,7 @@ class DeviceSlots:
             for name, shape in self._shapes.items()
         }
 
-    def require_free(self, in_flight: int) -> None:
+    def require_free(self, in_flight: int, *, is_retry: bool = False) -> None:
         """Returns the slots whose arrays no longer exist, and checks that one is free for a further step.
 
         Raises:
@@ -105,7 +106,11 @@ class DeviceSlots:
             for slot in released:
                 del self._steps[slot]
             self._connection.give_back([FIRST_DEVICE_SLOT + slot for slot in released])
-        if len(self._steps) + in_flight >= len(self._memory):
+        if len(self._steps) + in_flight >= len(self._memory) and not is_retry:
+            # Arrays may be parts of reference cycles.
+            gc.collect()
+            self.require_free(in_flight, is_retry=True)
+        elif len(self._steps) + in_flight >= len(self._memory):
             steps = ", ".join(str(step) for step in sorted(self._steps.values())) or "none"
             given = (
                 f"{len(self._memory)} in use: {in_flight} by steps in flight, the others by arrays of the steps {steps}"

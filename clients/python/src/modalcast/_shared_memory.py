@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import mmap
 import os
 import socket
@@ -74,7 +73,10 @@ class MemoryConnection:
             expected = f"{self._slot_count} slots of {self._slot_bytes} bytes"
             raise malformed("shared", expected, f"{length} bytes in slot {slot}")
         begin = slot * self._slot_bytes
-        return memoryview(self._replies)[begin : begin + length]
+        try:
+            return memoryview(self._replies)[begin : begin + length]
+        except ValueError:  # closed by another thread
+            raise ConnectionLost("the shared memory is closed") from None
 
     def give_back(self, slots: Sequence[int]) -> None:
         """Returns slots to the server. A server that has ended needs none."""
@@ -100,6 +102,9 @@ class MemoryConnection:
 
     def close(self) -> None:
         """Ends the connection, and frees the memory. No view of the data may exist."""
+        # Ends the connection also if a process that was forked has the socket, too.
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         # A view in an exception that is being handled keeps the mapping until it is gone.
         with contextlib.suppress(BufferError):
@@ -107,6 +112,8 @@ class MemoryConnection:
 
 
 def _receive_memory(connection: socket.socket) -> tuple[mmap.mmap, int, int, bytes]:
+    import fcntl  # not on every system that has this client
+
     message, files = _receive(connection, _HANDSHAKE.size, 2)
     try:
         version, slot_bytes, slot_count, _, token = _HANDSHAKE.unpack(message)
@@ -126,12 +133,15 @@ def _receive_memory(connection: socket.socket) -> tuple[mmap.mmap, int, int, byt
 def _receive(connection: socket.socket, length: int, max_files: int) -> tuple[bytes, list[int]]:
     """Receives a message of this length, and the file descriptors that come with it."""
     message, files, _, _ = socket.recv_fds(connection, length, max_files)
-    while len(message) < length:
-        more = connection.recv(length - len(message))
-        if not more:
-            _close_all(files)
-            raise OSError("the server has closed the connection")
-        message += more
+    try:
+        while len(message) < length:
+            more = connection.recv(length - len(message))
+            if not more:
+                raise OSError("the server has closed the connection")
+            message += more
+    except BaseException:
+        _close_all(files)
+        raise
     return message, list(files)
 
 

@@ -60,6 +60,10 @@ def _delete_capsule(capsule: int) -> None:
         _exported.pop(_pointer_of(capsule, b"dltensor"), None)
 
 
+# Tensors may exist longer than the modules of this package at the end of the process, so that these live for ever.
+for _kept in (_exported, _delete, _delete_capsule):
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(_kept))
+
 _new_capsule = ctypes.pythonapi.PyCapsule_New
 _new_capsule.restype = ctypes.py_object
 _new_capsule.argtypes = (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
@@ -105,8 +109,14 @@ class DeviceArray:
     def __dlpack_device__(self) -> tuple[int, int]:
         return (_CUDA, self.device)
 
-    def __dlpack__(self, *, stream: Any = None, **_: Any) -> object:
-        """A capsule for consumers of DLPack. No stream has to wait, because the pictures are complete."""
+    def __dlpack__(self, *, stream: Any = None, dl_device: Any = None, copy: bool | None = None, **_: Any) -> object:
+        """A capsule for consumers of DLPack. No stream has to wait, because the pictures are complete.
+
+        Raises:
+            BufferError: The consumer asks for a copy, or for another device.
+        """
+        if copy or dl_device not in (None, self.__dlpack_device__()):
+            raise BufferError(f"expected no copy and device {self.__dlpack_device__()}, got {copy} and {dl_device}")
         shape = (ctypes.c_int64 * len(self.shape))(*self.shape)
         data_type = _DataType(_TYPE_CODES[self.dtype.kind], 8 * self.dtype.itemsize, 1)
         tensor = _Tensor(self.address, _CUDA, self.device, len(self.shape), data_type, shape, None, 0)

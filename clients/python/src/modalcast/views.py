@@ -55,7 +55,7 @@ MAX_DEVICE_SLOTS = 16
 
 _DEFAULT_SIDE = 64
 
-# Bytes of pictures that a batch of states has at most. Two batches are in flight. Smaller batches would draw less
+# Bytes of pictures that a batch of states has at most. Three batches are in flight. Smaller batches would draw less
 # efficiently, because each one has a fixed cost of about a millisecond.
 _BATCH_BYTES = 32 << 20
 
@@ -276,7 +276,7 @@ def view_options(
     """Checks the arguments of `Scene.views`, which documents them.
 
     Raises:
-        TypeError: A camera is none.
+        TypeError: An item is not a Camera.
         ValueError: A number is out of range, or an output is unknown.
     """
     if not 1 <= operator.index(worlds) <= MAX_WORLDS:

@@ -18,7 +18,7 @@ from modalcast._methods import DRAW_VIEWS, DRIVE_SCENE, GET_SERVER_INFO, Method
 from modalcast._shared_memory import MemoryConnection
 from modalcast._step_progress import Progress, StreamProgress
 from modalcast._view_progress import ViewProgress
-from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, from_rpc_error
+from modalcast.errors import ConnectionLost, DeadlineExceeded, Error, MalformedReply, from_rpc_error
 from modalcast.v1 import steps_pb2
 
 RequestT = TypeVar("RequestT", bound=Message)
@@ -301,11 +301,14 @@ class Transport:
         return StepStream(lambda requests: call(requests, metadata=metadata), "drive", self.address, Progress())
 
     def open_memory(self) -> MemoryConnection | None:
-        """Connects to the shared memory of a server on this machine; None if it offers none, or has none left."""
+        """Connects to the shared memory of a server on this machine.
+
+        None if the server offers none to this client, has no connection left, or is of another version.
+        """
         path = self._route.memory_socket
         try:
             return None if path is None else MemoryConnection(path)
-        except ConnectionLost:
+        except (ConnectionLost, MalformedReply):
             return None
 
     def view_stream(self, memory: MemoryConnection | None = None) -> ViewStream:

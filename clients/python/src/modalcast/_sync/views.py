@@ -94,14 +94,18 @@ class Views:
         address = self._transport.address
         self._memory = memory = self._transport.open_memory()
         if self._options.device_slots > 0 and memory is None:
-            raise Unavailable(f"{address}: device='cuda': expected a server of this user on this machine")
+            given = "one without shared memory, or with no connection to it left"
+            raise Unavailable(f"{address}: device='cuda': expected a server of this user on this machine, got {given}")
         stream = self._transport.view_stream(memory)
         try:
             reply = parse("views", views_pb2.DrawViewsResponse, stream.open(request, self._timeout))
             self._check_opened(reply)
             if self._options.device_slots > 0 and memory is not None:
-                dtypes = {name: VIEW_FORMATS[name].dtype for name in self.shapes}
-                self._slots = DeviceSlots(memory, reply.opened.device_slots, self.shapes, dtypes)
+                # The arrays are in the order of the server.
+                names = {VIEW_FORMATS[name].output: name for name in self.shapes}
+                shapes = {names[output]: self.shapes[names[output]] for output in reply.opened.outputs}
+                dtypes = {name: VIEW_FORMATS[name].dtype for name in shapes}
+                self._slots = DeviceSlots(memory, reply.opened.device_slots, shapes, dtypes)
         except ServerError as error:
             self._end(stream)
             if error.code != "UNIMPLEMENTED":
@@ -295,6 +299,9 @@ class Views:
             "transforms": len(self._layout.roots),
         }
         given = {name: getattr(reply.opened, name) for name in expected}
+        outputs = sorted(VIEW_FORMATS[name].output for name in self.shapes)
+        if sorted(reply.opened.outputs) != outputs:
+            raise malformed("views.opened.outputs", str(outputs), str(list(reply.opened.outputs)))
         if given != expected:
             raise malformed("views.opened", str(expected), str(given))
 
