@@ -17,7 +17,7 @@ from modalcast._server_process import find_program
 
 ROOT = Path(__file__).parents[3]
 DOCUMENTS = [ROOT / name for name in ("README.md", "clients/python/README.md", "clients/recipes.md")]
-OPTIONAL_PACKAGES = ("mujoco", "torch")
+OPTIONAL_PACKAGES = ("mujoco", "torch", "webdataset")
 
 
 def blocks(language: str) -> Iterator[object]:
