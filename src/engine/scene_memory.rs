@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::engine::lock::lock;
 use crate::engine::memory_limits::MemoryLimits;
-use modalcast_model::domain::Shape;
+use modalcast_model::domain::{Shape, Transform};
 use modalcast_model::error::Result;
 use modalcast_model::memory::{MemoryBudget, MemoryGroup, MemoryReservation};
 use modalcast_model::scene::Scene;
@@ -21,6 +21,9 @@ const OUTPUT_SETS: u64 = 2;
 
 /// Pieces of a batch of views that exist at a time: one is drawn, two are sent.
 const PIECES_IN_MEMORY: u64 = 3;
+
+/// Copies of the state of worlds: the one that is shown, the next one, its step, and that of the deformer.
+const STATE_COPIES: u64 = 4;
 
 /// The budgets that all scenes share.
 #[derive(Debug)]
@@ -104,7 +107,9 @@ impl SceneMemory {
     pub(super) fn reserve_worlds(&self, name: &str, scene: &Scene, count: usize, picture_bytes: usize) -> Result<()> {
         let object = format!("{count} worlds of scene '{name}'");
         let pictures = PIECES_IN_MEMORY * picture_bytes as u64;
-        let shared = array_bytes(scene) + 4 * pixel_bytes(scene) / 3;
+        // The CPU has the levels of images in f32.
+        let images = if self.has_device { 4 * pixel_bytes(scene) / 3 } else { 16 * pixel_bytes(scene) / 3 };
+        let shared = array_bytes(scene) + view_table_bytes(scene) + images;
         let worlds = shared.saturating_add(world_bytes(scene, count));
         if self.has_device {
             self.host.resize(&object, worlds.saturating_add(pictures))?;
@@ -144,9 +149,17 @@ impl SceneMemory {
 }
 
 /// Bytes that `count` worlds of a scene take on the host and on the device, apart from the arrays that they share: as
-/// [`output_bytes`] and [`domain_bytes`] of all worlds.
+/// [`output_bytes`] and [`domain_bytes`] of all worlds, and several copies of their state.
 fn world_bytes(scene: &Scene, count: usize) -> u64 {
-    (count as u64).saturating_mul(output_bytes(scene) + domain_bytes(scene))
+    let (coordinates, transforms) = (scene.layout.coordinates as u64, scene.transform_roots.count() as u64);
+    let state = size_of::<f32>() as u64 * coordinates + size_of::<Transform>() as u64 * transforms;
+    (count as u64).saturating_mul(output_bytes(scene) + domain_bytes(scene) + STATE_COPIES * state)
+}
+
+/// Bytes of the tables of a view renderer: per triangle its vertices, corners, material and domain, and per corner its
+/// texture coordinates.
+fn view_table_bytes(scene: &Scene) -> u64 {
+    32 * scene.layout.triangles as u64 + 8 * scene.layout.corners as u64
 }
 
 /// Host memory of a scene: its arrays and pixels, and copies of the outputs of a deformer.

@@ -91,3 +91,30 @@ async fn dropped_sessions_return_their_memory() {
     };
     tokio::time::timeout(crate::hang_guard::HANG_GUARD, returned).await.expect("expected the memory to be returned");
 }
+
+/// A client that opens calls as long as it can leaves some for another principal.
+#[tokio::test]
+async fn calls_of_one_client_leave_some_for_others() {
+    let folder = tempfile::tempdir().expect("expected a temporary folder");
+    let (engine, scene) = start_engine(&folder).await;
+    let account = |principal: &str| Account { principal: Some(principal.into()), client: Client::Connection(1) };
+    let open =
+        async |principal: &str| engine.open_views(&scene, &account(principal), settings(1, 1, Pairing::Every)).await;
+    let mut of_anna = Vec::new();
+    let refusal = loop {
+        match open("anna").await {
+            Ok(session) => of_anna.push(session),
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(refusal, Error::LimitReached { .. }), "{refusal}");
+    assert_eq!(of_anna.len(), 56, "expected 8 of 64 to be left");
+    open("ben").await.expect("expected one of the others");
+    of_anna.truncate(40);
+    let returned = async {
+        while open("anna").await.is_err() {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+    };
+    tokio::time::timeout(crate::hang_guard::HANG_GUARD, returned).await.expect("expected a returned permit");
+}
