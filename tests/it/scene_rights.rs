@@ -60,6 +60,9 @@ fn calls() -> Vec<(&'static str, Vec<u8>, Right)> {
     let frames = |delivery| v1::StreamFramesRequest { scene: scene(), delivery, ..Default::default() }.encode_to_vec();
     let vertices =
         |delivery| v1::StreamVerticesRequest { scene: scene(), delivery, ..Default::default() }.encode_to_vec();
+    let views = v1::OpenViews { scene: scene(), ..Default::default() };
+    let kind = Some(v1::draw_views_request::Kind::Open(views));
+    let views = v1::DrawViewsRequest { kind }.encode_to_vec();
     let states = |delivery| v1::StreamStatesRequest { scene: scene(), delivery, ..Default::default() }.encode_to_vec();
     vec![
         ("modalcast.v1.FrameService/RenderFrame", named.clone(), Use),
@@ -75,6 +78,7 @@ fn calls() -> Vec<(&'static str, Vec<u8>, Right)> {
         ("modalcast.v1.StateService/GetState", named.clone(), Use),
         ("modalcast.v1.StateService/StreamStates", states(latest), Use),
         ("modalcast.v1.StateService/StreamStates", states(lossless), Control),
+        ("modalcast.v1.ViewService/DrawViews", views, Use),
         ("modalcast.v1.ForceService/StreamForces", named.clone(), Use),
         ("modalcast.v1.ForceService/ApplyForces", named.clone(), Use),
         ("modalcast.v1.StepService/ResetScene", named.clone(), Control),

@@ -6,7 +6,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::loaded_scene::LoadedScene;
-use super::loaded_worlds::LoadedWorlds;
 use crate::config::{BackendChoice, Config, EncodeChoice, RendererChoice};
 use crate::engine::memory_limits::MemoryLimits;
 use crate::engine::output::output_spec::{FrameOutput, PictureContent};
@@ -337,15 +336,11 @@ impl DeviceContext {
     pub fn unload_scene(&mut self, loaded_scene: LoadedScene) {
         let buffers = loaded_scene.into_buffers();
         self.free_buffers(buffers);
-        if let Some(device) = &self.cuda_device {
-            // A lost device reports its error at the next step.
-            device.synchronize("unload").ok();
-        }
+        self.wait_for_freed_memory();
     }
 
-    /// Frees loaded worlds. Waits until CUDA has freed their memory.
-    pub(super) fn unload_worlds(&self, worlds: LoadedWorlds) {
-        drop(worlds);
+    /// Waits until CUDA has freed the memory that was dropped, so that it is available to the next scene.
+    pub(super) fn wait_for_freed_memory(&self) {
         if let Some(device) = &self.cuda_device {
             // A lost device reports its error at the next step.
             device.synchronize("unload").ok();

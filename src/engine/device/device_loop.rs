@@ -403,8 +403,8 @@ impl DeviceLoop {
         if let Some(scene) = self.scenes.remove(&id) {
             self.context.unload_scene(scene);
         }
-        if let Some(worlds) = self.worlds.remove(&id) {
-            self.context.unload_worlds(worlds);
+        if self.worlds.remove(&id).is_some() {
+            self.context.wait_for_freed_memory();
         }
         self.queue.forget(id);
     }
@@ -537,9 +537,7 @@ impl Drop for DeviceLoop {
         for scene in scenes {
             run_caught(|| self.context.unload_scene(scene));
         }
-        for (_, worlds) in self.worlds.drain() {
-            run_caught(|| self.context.unload_worlds(worlds));
-        }
+        run_caught(|| self.worlds.clear());
     }
 }
 

@@ -50,9 +50,7 @@ impl DeviceLoop {
         self.fail_outputs(&output_error);
         let scenes = self.unload_all();
         // Worlds are not loaded again: their calls get an error, and their clients can open them again.
-        for (_, worlds) in std::mem::take(&mut self.worlds) {
-            run_caught(|| self.context.unload_worlds(worlds));
-        }
+        run_caught(|| self.worlds.clear());
         self.context.reopen_renderer()?;
         let count = scenes.len();
         for SceneToRestore { id, scene, state, backends } in scenes {
