@@ -147,7 +147,7 @@ impl Engine {
             Ok((static_data, shown, Worlds { scene, all, settings }))
         };
         let (static_data, shown, worlds) = run_blocking("worlds", build).await?;
-        // Without a name: the crash log must not set the scene aside because of what one caller does to its copies.
+        // The work has no scene's name: a crash in these copies must not make the crash log set the scene aside.
         let id = self.shared.next_scene_id.fetch_add(1, Ordering::Relaxed);
         let device = self.shared.services.device.clone();
         let on_device = WorldsOnDevice { device, id, resources: Some((memory, permit)) };

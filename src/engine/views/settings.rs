@@ -14,7 +14,7 @@ const PIECE_BYTES: usize = 8 << 20;
 pub enum Pairing {
     /// With C cameras, view w C + c shows world w as camera c sees it.
     Every,
-    /// View c shows this world of camera c as camera c sees it.
+    /// One world per camera, by the index of the camera: view c shows it as camera c sees it.
     One(Arc<[u32]>),
 }
 

@@ -60,9 +60,9 @@ def _delete_capsule(capsule: int) -> None:
         _exported.pop(_pointer_of(capsule, b"dltensor"), None)
 
 
-# Tensors may exist longer than the modules of this package at the end of the process, so that these live for ever.
-for _kept in (_exported, _delete, _delete_capsule):
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(_kept))
+# At the end of the process, tensors may exist longer than this module. They still call these functions.
+for _object in (_exported, _delete, _delete_capsule):
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(_object))
 
 _new_capsule = ctypes.pythonapi.PyCapsule_New
 _new_capsule.restype = ctypes.py_object
